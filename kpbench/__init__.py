@@ -1,0 +1,42 @@
+"""kpbench: design, print, synthesise and score keypoint patches.
+
+The names below are imported when first used, so that ``import kpbench`` loads neither torch, h5py nor
+onnxruntime.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Detections": "keypoints",
+    "KEYPOINT_DTYPE": "keypoints",
+    "KpbenchError": "errors",
+    "Patch": "design",
+    "Truth": "keypoints",
+    "generate": "pipeline",
+    "load_detector": "detect",
+    "load_patches": "design",
+    "open_dataset": "store",
+    "predict": "pipeline",
+    "read_predictions": "predictions",
+    "render_scene": "scene",
+    "score": "score",
+    "shipped_patches": "design",
+    "write_predictions": "predictions",
+}
+
+__all__ = ["__version__", *sorted(_HOMES)]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'kpbench' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"kpbench.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

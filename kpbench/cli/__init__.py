@@ -1,0 +1,64 @@
+"""The command line: parse, call one function of the library, print. Nothing imports it."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from kpbench import __version__
+from kpbench.errors import KpbenchError
+
+# Each command lives in a module that is imported only when the command is used: `kpbench --help`
+# must not wait for OpenCV, HDF5 or torch. The second entry is its line in the list of commands.
+COMMANDS = {
+    "render-patches": ("patches:render_patches", "Print the patches or a board, true to scale."),
+    "analyze-patches": ("analysis:analyze_patches", "Measure designs: localisation, confusion, look-alikes."),
+    "synth": ("data:synth", "Write a synthetic labelled dataset."),
+    "inspect": ("data:inspect", "Say what is in a dataset."),
+    "verify": ("data:verify", "Check every byte of a dataset."),
+    "preview": ("data:preview", "Draw a contact sheet with the true keypoints."),
+    "detect": ("detecting:detect", "Run a detector over a dataset or image files."),
+    "score": ("scoring:score", "Score a predictions file with the paper's metrics."),
+    "demo": ("demo:demo", "The whole chain, small, in about a minute."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module when the command is run, and turns errors into exit codes."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in COMMANDS:
+            return None
+        module, attribute = COMMANDS[cmd_name][0].split(":")
+        command: click.Command = getattr(importlib.import_module(f"kpbench.cli.{module}"), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+    def invoke(self, ctx: click.Context) -> object:
+        try:
+            return super().invoke(ctx)
+        except KpbenchError as error:
+            click.echo(f"kpbench: {error}", err=True)
+            sys.exit(1)
+        except (KeyboardInterrupt, click.Abort) as stop:
+            click.echo(f"kpbench: interrupted{f': {stop}' if str(stop) else ''}", err=True)
+            sys.exit(130)
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="kpbench")
+def main() -> None:
+    """Keypoint patches: print them, synthesise labelled images, score any detector.
+
+    \b
+    Start here:
+      kpbench demo
+    """

@@ -1,0 +1,363 @@
+"""Patch designs: TOML in, frozen :class:`Patch` out, with its exact outline.
+
+A patch is a disc of radius 1 in one ink, on which semi-circles that share its centre are painted one
+after the other, each in black, white, or inverting what lies below. What results is always a polar
+chequer: rings between the radii, sectors between the angles, each cell black or white
+(:meth:`Patch.cells`). Everything else (outline, ink at a point) is read off those cells.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from kpbench.errors import DesignError
+from kpbench.keypoints import Float
+from kpbench.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
+
+__all__ = ["Patch", "SemiCircle", "load_patch", "load_patches", "parse_patch", "shipped_patches"]
+
+SCHEMA = "kpbench.patch/1"
+INKS = ("black", "white", "invert")
+
+
+@dataclass(frozen=True)
+class SemiCircle:
+    """Half a disc about the shared centre: the angles from ``start_deg`` to ``start_deg + 180``."""
+
+    radius: float
+    start_deg: float
+    ink: str
+
+
+@dataclass(frozen=True)
+class Patch:
+    """One keypoint patch, in the patch frame (unit disc, u right, v down, angles clockwise).
+
+    Attributes
+    ----------
+    name : str
+    patch_id : int
+        The identity that detectors report.
+    disc : str
+        Ink of the disc below the semi-circles, "black" or "white".
+    semicircles : tuple of SemiCircle
+        Painted in order.
+    rim : float
+        Width of a ring around the disc, as a fraction of the disc's radius; 0 for none.
+    rim_ink : str
+        "black" or "white".
+    quiet_zone : float
+        Width of a white ring outside the rim, as a fraction of the disc's radius.
+    """
+
+    name: str
+    patch_id: int
+    disc: str
+    semicircles: tuple[SemiCircle, ...]
+    rim: float = 0.0
+    rim_ink: str = "white"
+    quiet_zone: float = 0.0
+
+    @property
+    def extent(self) -> float:
+        """Radius of all that belongs to the patch, rim and quiet zone included, in disc radii."""
+        return 1.0 + self.rim + self.quiet_zone
+
+    @cached_property
+    def cells(self) -> tuple[Float, Float, NDArray[np.bool_]]:
+        """The polar chequer: (radii, angles_deg, black).
+
+        ``radii`` of shape (R + 1,) starts at 0; ``angles_deg`` of shape (A,) is sorted in [0, 360);
+        ``black[i, j]`` says whether the cell between radii i and i + 1 and between angles j and
+        j + 1 (cyclic) is black. Borders between cells of equal ink are already removed where they
+        run through all sectors or all rings.
+        """
+        radii = np.unique([0.0, 1.0, *(s.radius for s in self.semicircles)])
+        angles = np.unique(np.round([(s.start_deg + a) % 360.0 for s in self.semicircles for a in (0, 180)], 9))
+        if not len(angles):
+            angles = np.array([0.0])
+        middle_radius = (radii[1:] + radii[:-1]) / 2
+        middle_angle = (angles + np.append(angles[1:], angles[0] + 360)) / 2
+        black = np.full((len(middle_radius), len(angles)), self.disc == "black")
+        for s in self.semicircles:
+            inside = np.outer(middle_radius < s.radius, (middle_angle - s.start_deg) % 360.0 < 180.0)
+            black = np.where(inside, ~black if s.ink == "invert" else s.ink == "black", black)
+        keep = np.append(np.any(black[1:] != black[:-1], axis=1), True)
+        radii, black = np.append(0.0, radii[1:][keep]), black[keep]
+        keep = np.any(black != np.roll(black, 1, axis=1), axis=0)
+        if not keep.any():
+            keep[0] = True
+        angles, black = angles[keep], black[:, keep]
+        for width, ink in ((self.rim, self.rim_ink), (self.quiet_zone, "white")):
+            if width:
+                radii = np.append(radii, radii[-1] + width)
+                black = np.vstack([black, np.full((1, black.shape[1]), ink == "black")])
+        return radii, angles, black
+
+    def is_black(self, points: ArrayLike) -> NDArray[np.bool_]:
+        """Ink at points of the patch frame, shape (..., 2) to (...); outside the patch is white."""
+        u, v = np.moveaxis(np.asarray(points, np.float64), -1, 0)
+        radii, angles, black = self.cells
+        ring = np.searchsorted(radii, np.hypot(u, v), side="right") - 1
+        sector = (np.searchsorted(angles, np.degrees(np.arctan2(v, u)) % 360.0, side="right") - 1) % len(angles)
+        padded = np.vstack([black, np.zeros((1, black.shape[1]), bool)])
+        return cast(NDArray[np.bool_], padded[np.minimum(ring, len(black)), sector])
+
+    @cached_property
+    def black_region(self) -> Region:
+        """Exact outline of all black ink: cells that touch along an edge are merged, so no seams."""
+        return _trace(*self.cells)
+
+    @property
+    def disc_region(self) -> Region:
+        """Exact outline of the whole patch, rim and quiet zone included."""
+        return circle(0.0, 0.0, self.extent)
+
+    @property
+    def centre_is_crossing(self) -> bool:
+        """Whether straight edges of at least two directions meet at the centre.
+
+        Such a centre is the meeting point of image lines under any perspective; one edge alone
+        leaves the centre loose along itself, and a centre of arcs only is biased under tilt.
+        """
+        _, angles, black = self.cells
+        edges = angles[black[0] != np.roll(black[0], 1)]
+        return len(np.unique(np.round(edges % 180.0, 6))) >= 2
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the ink itself: designs that print alike have the same digest."""
+        radii, angles, black = self.cells
+        content = (np.round(radii, 9).tolist(), np.round(angles, 9).tolist(), black.astype(int).tolist())
+        return hashlib.sha256(repr(content).encode()).hexdigest()
+
+    def to_dict(self) -> dict[str, Any]:
+        """The design as its TOML table; ``parse_patch(patch.to_dict(), ...)`` gives it back."""
+        table: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "id": self.patch_id, "disc": self.disc}
+        table["semicircles"] = [{"radius": s.radius, "start_deg": s.start_deg, "ink": s.ink} for s in self.semicircles]
+        if self.rim:
+            table["rim"] = {"width": self.rim, "ink": self.rim_ink}
+        if self.quiet_zone:
+            table["quiet_zone"] = self.quiet_zone
+        return table
+
+
+@lru_cache(maxsize=256)
+def unit_polygons(patch: Patch, tolerance: float) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
+    """(black, whole patch) as polygons of the patch frame, see :func:`kpbench.outline.flatten`."""
+    return tuple(flatten(patch.black_region, tolerance)), tuple(flatten(patch.disc_region, tolerance))
+
+
+def _trace(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Region:
+    """Contours of the black cells: all cell borders, less those that two black cells share."""
+    rings, sectors = black.shape
+    width = np.diff(np.append(angles, angles[0] + 360.0))
+    # A node is (ring border, angle); all nodes at radius 0 are the centre. Borders run so that ink is
+    # on the same side of each, hence one that two black cells share appears once in each direction.
+    borders: dict[tuple[Any, Any, str], float] = {}
+
+    def add(start: tuple[int, int], end: tuple[int, int], kind: str, sweep: float) -> None:
+        a = (start[0], 0) if start[0] == 0 else start
+        b = (end[0], 0) if end[0] == 0 else end
+        if borders.pop((b, a, kind), None) is None:
+            borders[a, b, kind] = sweep
+
+    if sectors == 1:  # whole rings: nothing is straight
+        contours: list[Contour] = []
+        for i in range(rings):
+            inner, outer = black[i - 1, 0] if i else black[i, 0], black[i, 0]
+            if i and inner != outer:
+                contours.append((Arc(0, 0, radii[i], 0.0, 360.0 if inner else -360.0),))
+        if black[-1, 0]:
+            contours.append((Arc(0, 0, radii[-1], 0.0, 360.0),))
+        return tuple(contours)
+    for i in range(rings):
+        for j in range(sectors):
+            if not black[i, j]:
+                continue
+            k = (j + 1) % sectors
+            add((i + 1, j), (i + 1, k), f"arc{i + 1},{j}", width[j])
+            add((i + 1, k), (i, k), f"line{i},{k}", 0.0)
+            if i:
+                add((i, k), (i, j), f"arc{i},{j}", -width[j])
+            add((i, j), (i + 1, j), f"line{i},{j}", 0.0)
+    return _chain(borders, radii, angles)
+
+
+def _chain(borders: dict[tuple[Any, Any, str], float], radii: Float, angles: Float) -> Region:
+    """Join directed borders end to start into closed contours."""
+    leaving: dict[Any, list[tuple[Any, Any, str]]] = {}
+    for key in borders:
+        leaving.setdefault(key[0], []).append(key)
+    contours = []
+    while leaving:
+        first = next(iter(leaving))
+        chain: list[tuple[Any, Any, str]] = []
+        node = first
+        while True:
+            choices = leaving[node]
+            chain.append(choices.pop(_turn(chain[-1], choices, angles) if chain else 0))
+            if not choices:
+                del leaving[node]
+            node = chain[-1][1]
+            if node == first:
+                break
+        contours.append(_merge([_segment(key, borders[key], radii, angles) for key in chain]))
+    return tuple(contours)
+
+
+def _turn(arrived: tuple[Any, Any, str], choices: list[tuple[Any, Any, str]], angles: Float) -> int:
+    """Which border to follow where black cells touch at a point: the one that stays on the same cell.
+
+    At the centre, ink lies clockwise of a leaving edge and anticlockwise of an arriving one, so the
+    same sector's leaving edge is the nearest one anticlockwise of the arriving edge.
+    """
+    if arrived[1][0] != 0 or len(choices) == 1:
+        return next((n for n, c in enumerate(choices) if c[2][:3] != arrived[2][:3]), 0)
+    came = angles[arrived[0][1]]
+    return int(np.argmin([(came - angles[c[1][1]] - 1e-9) % 360.0 for c in choices]))
+
+
+def _segment(key: tuple[Any, Any, str], sweep: float, radii: Float, angles: Float) -> Line | Arc:
+    (i, j), (k, m), kind = key
+    if kind.startswith("arc"):
+        return Arc(0.0, 0.0, float(radii[i]), float(angles[j]), float(sweep))
+    (c0, s0), (c1, s1) = cos_sin_deg(float(angles[j])), cos_sin_deg(float(angles[m]))
+    near, far = float(radii[i]), float(radii[k])
+    return Line(near * c0, near * s0, far * c1, far * s1)
+
+
+def _merge(contour: list[Line | Arc]) -> Contour:
+    """Join arcs that continue each other; a line through the centre keeps the centre as a vertex."""
+    for _ in contour:  # start where a new arc starts, so that no arc is split by the contour's start
+        if isinstance(contour[0], Arc) and isinstance(contour[-1], Arc) and _continues(contour[-1], contour[0]):
+            contour = contour[1:] + contour[:1]
+    merged: list[Line | Arc] = []
+    for part in contour:
+        last = merged[-1] if merged else None
+        if isinstance(last, Arc) and isinstance(part, Arc) and _continues(last, part):
+            merged[-1] = Arc(0.0, 0.0, last.radius, last.start_deg, last.sweep_deg + part.sweep_deg)
+        else:
+            merged.append(part)
+    return tuple(merged)
+
+
+def _continues(before: Arc, after: Arc) -> bool:
+    return before.radius == after.radius and before.sweep_deg * after.sweep_deg > 0
+
+
+def parse_patch(table: Mapping[str, Any], source: str) -> Patch:
+    """Build a patch from its TOML table.
+
+    Raises
+    ------
+    DesignError
+        One line that names ``source``, the key and what was expected.
+    """
+
+    def fail(message: str) -> DesignError:
+        return DesignError(f"{source}: {message}")
+
+    def number(value: object, key: str, low: float, high: float) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise fail(f"{key} is {value!r}, expected a number from {low:g} to {high:g}")
+        return float(value)
+
+    def choice(value: object, key: str, known: Sequence[str]) -> str:
+        if value not in known:
+            raise fail(f"{key} is {value!r}, expected one of: {', '.join(known)}")
+        return str(value)
+
+    def keys(value: object, key: str, known: Sequence[str]) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping):
+            raise fail(f"{key} is {value!r}, expected a table with: {', '.join(known)}")
+        for name in value:
+            if name not in known:
+                raise fail(f"unknown key {name!r} in {key}; known are: {', '.join(known)}")
+        return value
+
+    keys(table, "the design", ("schema", "name", "id", "disc", "semicircles", "rim", "quiet_zone"))
+    if table.get("schema", SCHEMA) != SCHEMA:
+        raise fail(f"schema is {table['schema']!r}, expected {SCHEMA!r}")
+    name = table.get("name")
+    if not isinstance(name, str) or not name:
+        raise fail(f"name is {name!r}, expected a non-empty text")
+    patch_id = table.get("id")
+    if isinstance(patch_id, bool) or not isinstance(patch_id, int) or not 0 <= patch_id <= 32767:
+        raise fail(f"id is {patch_id!r}, expected a whole number from 0 to 32767")
+    listed = table.get("semicircles")
+    if not isinstance(listed, list):
+        raise fail(f"semicircles is {listed!r}, expected a list of tables with: radius, start_deg, ink")
+    semicircles = []
+    for n, entry in enumerate(listed):
+        place = f"semicircles[{n}]"
+        entry = keys(entry, place, ("radius", "start_deg", "ink"))
+        semicircles.append(
+            SemiCircle(
+                number(entry.get("radius", 1.0), f"{place}.radius", 0.01, 1.0),
+                number(entry.get("start_deg"), f"{place}.start_deg", -360.0, 360.0),
+                choice(entry.get("ink"), f"{place}.ink", INKS),
+            )
+        )
+    rim = keys(table.get("rim", {}), "rim", ("width", "ink"))
+    return Patch(
+        name=name,
+        patch_id=patch_id,
+        disc=choice(table.get("disc", "white"), "disc", ("black", "white")),
+        semicircles=tuple(semicircles),
+        rim=number(rim.get("width", 0.0), "rim.width", 0.0, 2.0),
+        rim_ink=choice(rim.get("ink", "white"), "rim.ink", ("black", "white")),
+        quiet_zone=number(table.get("quiet_zone", 0.0), "quiet_zone", 0.0, 2.0),
+    )
+
+
+def load_patch(path: str | Path) -> Patch:
+    """Read one design file.
+
+    Raises
+    ------
+    DesignError
+        If it cannot be read, is no TOML, or is no design.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DesignError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DesignError(f"{path}: not valid TOML ({error})") from None
+    return parse_patch(table, str(path))
+
+
+def load_patches(paths: Sequence[str | Path]) -> tuple[Patch, ...]:
+    """Read several design files, in order of their ids.
+
+    Raises
+    ------
+    DesignError
+        As :func:`load_patch`, or if two designs share an id.
+    """
+    patches: dict[int, tuple[str | Path, Patch]] = {}
+    for path in paths:
+        patch = load_patch(path)
+        if patch.patch_id in patches:
+            raise DesignError(f"{path}: id {patch.patch_id} is taken by {patches[patch.patch_id][0]}")
+        patches[patch.patch_id] = (path, patch)
+    return tuple(patches[key][1] for key in sorted(patches))
+
+
+@lru_cache(maxsize=1)
+def shipped_patches() -> tuple[Patch, ...]:
+    """The four designs that ship with kpbench, in order of their ids."""
+    inside = resources.files("kpbench") / "patches"
+    folder = inside if inside.is_dir() else Path(__file__).parent.parent / "patches"
+    return load_patches(sorted(Path(str(entry)) for entry in folder.iterdir() if entry.name.endswith(".toml")))

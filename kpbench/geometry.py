@@ -1,0 +1,110 @@
+"""Points, homographies, ellipses, camera and pose, and *the* pixel convention.
+
+Conventions
+-----------
+* Image frame: x right, y down, float64 px, the **centre** of the top-left pixel is (0, 0) (OpenCV).
+  Pixel (column j, row i) covers ``[j - 0.5, j + 0.5] x [i - 0.5, i + 0.5]``.
+* Patch frame: the patch is the unit disc; u right, v down. Angles grow from +u towards +v,
+  which is clockwise for somebody who looks at the patch.
+* Board frame: mm, x right, y down, z away from the viewer; the origin is the board's centre.
+* Camera frame: x right, y down, z forward. ``H_a2b`` maps frame a to frame b.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kpbench.keypoints import Float
+
+__all__ = ["Camera", "Ellipse", "jacobian", "plane_to_camera", "project", "projected_disc", "rotation_xyz"]
+
+
+def project(H_a2b: Float, points_a: ArrayLike) -> Float:
+    """Map points through a homography.
+
+    Parameters
+    ----------
+    H_a2b : ndarray of shape (3, 3)
+    points_a : array_like of shape (N, 2)
+
+    Returns
+    -------
+    ndarray of shape (N, 2)
+    """
+    points = np.asarray(points_a, np.float64)
+    mapped = points @ H_a2b[:, :2].T + H_a2b[:, 2]
+    return np.asarray(mapped[:, :2] / mapped[:, 2:])
+
+
+def jacobian(H_a2b: Float, point_a: ArrayLike) -> Float:
+    """Derivative of :func:`project` at one point, ndarray of shape (2, 2)."""
+    x, y = np.asarray(point_a, np.float64)
+    mapped = H_a2b @ np.array([x, y, 1.0])
+    return np.asarray((H_a2b[:2, :2] - np.outer(mapped[:2] / mapped[2], H_a2b[2, :2])) / mapped[2])
+
+
+@dataclass(frozen=True)
+class Ellipse:
+    """An ellipse in px: centre, semi-axes, and the angle of the major axis in [0, 180) degrees."""
+
+    x: float
+    y: float
+    major: float
+    minor: float
+    angle_deg: float
+
+
+def projected_disc(H_patch2image: Float) -> Ellipse:
+    """Image of the unit circle under a homography.
+
+    The dual conic of the unit circle is diag(1, 1, -1); under H it becomes H C* Hᵀ (Hartley and
+    Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). Its centre is *not* the image of the
+    disc's centre unless H is affine.
+
+    Raises
+    ------
+    ValueError
+        If the disc touches or crosses the camera's horizon, so that its image is no ellipse.
+    """
+    dual = H_patch2image @ np.diag([1.0, 1.0, -1.0]) @ H_patch2image.T
+    if dual[2, 2] >= 0:
+        raise ValueError("the disc reaches the horizon of the camera: its image is not an ellipse")
+    dual = dual / dual[2, 2]
+    x, y = dual[0, 2], dual[1, 2]
+    shape = np.array([[x * x, x * y], [x * y, y * y]]) - dual[:2, :2]
+    values, vectors = np.linalg.eigh(shape)
+    minor, major = np.sqrt(np.maximum(values, 0.0))
+    angle_deg = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180.0
+    return Ellipse(float(x), float(y), float(major), float(minor), float(angle_deg))
+
+
+def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:
+    """Rotation by z first, then y, then x about the fixed axes: ``Rx @ Ry @ Rz``, shape (3, 3)."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(a := np.radians([x_deg, y_deg, z_deg])), np.sin(a)
+    Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    Ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(Rx @ Ry @ Rz)
+
+
+def plane_to_camera(R_plane2camera: Float, t_camera: ArrayLike) -> Float:
+    """The 3x3 matrix ``[r1 r2 t]`` that takes (x, y, 1) on a plane to the camera frame."""
+    return np.column_stack([R_plane2camera[:, :2], np.asarray(t_camera, np.float64)])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: image size and focal length in px, principal point at the image's centre."""
+
+    width_px: int
+    height_px: int
+    focal_px: float
+
+    @property
+    def K(self) -> Float:
+        """Intrinsic matrix, camera frame to px, ndarray of shape (3, 3)."""
+        cx, cy = (self.width_px - 1) / 2, (self.height_px - 1) / 2
+        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
