@@ -31,7 +31,7 @@ def box_taps(kernel_px: float) -> Float:
     reach = int(np.ceil((kernel_px - 1) / 2))
     taps = np.ones(2 * reach + 1)
     taps[[0, -1]] -= (2 * reach + 1 - kernel_px) / 2 if reach else 0.0
-    return taps / taps.sum()
+    return np.asarray(taps / taps.sum())
 
 
 def blur(image: UInt8, kernel_px: float) -> UInt8:
@@ -131,7 +131,7 @@ def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[
     effects : list of dict
         What was applied, in order, with the parameters that were drawn.
     """
-    drawn = {
+    drawn: dict[str, dict[str, Any]] = {
         "shadow": {"seed": int(rng.integers(2**31))},
         "rain": {"seed": int(rng.integers(2**31))},
         "motion_blur": {"length_px": round(rng.uniform(3, 9), 2), "angle_deg": round(rng.uniform(0, 180), 1)},

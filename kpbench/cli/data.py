@@ -1,0 +1,177 @@
+"""Commands that make and look at datasets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kpbench.cli.options import SIZE
+
+__all__ = ["inspect", "preview", "synth", "verify"]
+
+DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
+
+
+@click.command()
+@click.option("--n", "n", type=int, required=True, help="Number of images.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-data"), show_default=True)
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.option("--size", type=SIZE, default="640x480", show_default=True)
+@click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
+@click.option("--deteriorate", type=click.Choice(["none", "paper"]), default="paper", show_default=True)
+@click.option("--shard-size", type=int, default=500, show_default=True, help="Images a file.")
+@click.option("--workers", type=int, help="Processes; default: one a core.")
+@click.option("--resume", is_flag=True, help="Finish an interrupted run.")
+@click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
+def synth(
+    n: int,
+    out: Path,
+    seed: int,
+    backgrounds: Path | None,
+    size: tuple[int, int],
+    channels: int,
+    deteriorate: str,
+    shard_size: int,
+    workers: int | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Write N synthetic labelled images into a dataset folder.
+
+    \b
+    Example:
+      kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.pipeline import SynthConfig, generate
+
+    if resume and overwrite:
+        raise click.UsageError("--resume and --overwrite exclude each other")
+    config = SynthConfig(n, seed, size, channels, deteriorate, shard_size, backgrounds)
+    try:
+        with progress_bar(n, "synth") as progress:
+            run = generate(config, out, workers=workers, resume=resume, overwrite=overwrite, progress=progress)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
+    if run.broken:
+        shown = ", ".join(run.broken[:5]) + (" …" if len(run.broken) > 5 else "")
+        click.echo(
+            f"kpbench: {len(run.broken)} background files could not be decoded and were passed over: {shown}", err=True
+        )
+    dataset = run.dataset
+    click.echo(
+        f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}"
+    )
+
+
+@click.command()
+@DATASET
+def inspect(dataset: Path) -> None:
+    """Say what is in a dataset: size, counts, and how its keypoints are distributed.
+
+    \b
+    Example:
+      kpbench inspect kpbench-data
+    """
+    import numpy as np
+
+    from kpbench.store import open_dataset
+
+    data = open_dataset(dataset)
+    truth = data.truth
+    keypoints = truth.keypoints
+    image = data.image(0)
+    size = sum(shard.bytes for shard in data.shards)
+    click.echo(f"dataset      {data.path}")
+    click.echo(f"fingerprint  {data.fingerprint}")
+    click.echo(f"images       {len(data)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}")
+    click.echo(
+        f"on disk      {size / 1e6:.1f} MB in {len(data.shards)} shards, {size / len(data) / 1e3:.1f} kB an image"
+    )
+    click.echo(
+        f"made from    seed {data.config.get('seed')}, {data.config.get('backgrounds', {}).get('kind', 'n/a')} "
+        f"backgrounds, deterioration {data.config.get('deteriorate', 'n/a')}"
+    )
+    ids, counts = np.unique(keypoints["patch_id"], return_counts=True)
+    click.echo(f"keypoints    {len(keypoints)}" + "".join(f", id {i}: {c}" for i, c in zip(ids, counts, strict=True)))
+    per_image = np.diff(truth.offsets)
+    click.echo(_histogram("an image", per_image, np.arange(per_image.max() + 2) - 0.5, "{:.0f}", centred=True))
+    if len(keypoints):
+        major, minor = keypoints["radius_major"], keypoints["radius_minor"]
+        octaves = np.array([0, 5, 8, 12, 20, 32, 50, 80, np.inf])
+        click.echo(_histogram("radius (major semi-axis), px", major, octaves, "{:g}"))
+        click.echo(_histogram("(major - minor) / major", (major - minor) / major, np.linspace(0, 1, 6), "{:.1f}"))
+        click.echo(
+            _histogram(
+                "contrast, grey levels",
+                keypoints["contrast"],
+                np.array([-np.inf, 0, 25, 50, 100, 150, 200, 256]),
+                "{:g}",
+            )
+        )
+        click.echo(_histogram("visible fraction", keypoints["visible"], np.array([0, 0.5, 0.75, 0.99, 1.01]), "{:g}"))
+
+
+def _histogram(title: str, values: object, edges: object, label: str, centred: bool = False) -> str:
+    """A histogram as text, one line a bin."""
+    import numpy as np
+
+    borders = np.asarray(edges)
+    counts, _ = np.histogram(np.asarray(values), borders)
+    total, most = max(int(counts.sum()), 1), max(int(counts.max()), 1)
+    lines = [title]
+    for low, high, count in zip(borders[:-1], borders[1:], counts, strict=True):
+        name = label.format((low + high) / 2) if centred else f"{label.format(low)} to {label.format(high)}"
+        lines.append(f"  {name:>14} {count:>8} {count / total:6.1%} {'#' * round(30 * count / most)}")
+    return "\n".join(lines)
+
+
+@click.command()
+@DATASET
+def verify(dataset: Path) -> None:
+    """Check every byte of a dataset against its manifest; exit 1 at the first that differs.
+
+    \b
+    Example:
+      kpbench verify kpbench-data
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.store import open_dataset
+
+    data = open_dataset(dataset)
+    with progress_bar(len(data), "verify") as progress:
+        for shard in data.verify():
+            progress(shard.count)
+    click.echo(f"{dataset}: {len(data)} images in {len(data.shards)} shards, all as written")
+
+
+@click.command()
+@DATASET
+@click.option("--out", type=click.Path(path_type=Path), help="PNG file; default: preview.png in the dataset.")
+@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Images on the sheet.")
+@click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True)
+@click.option(
+    "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image, px."
+)
+def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
+    """Draw a contact sheet of evenly spaced images with their true keypoints.
+
+    \b
+    Example:
+      kpbench preview kpbench-data --count 20 --columns 5
+    """
+    import cv2
+    import numpy as np
+
+    from kpbench.preview import contact_sheet, draw_keypoints
+    from kpbench.store import open_dataset, write_atomic
+
+    data = open_dataset(dataset)
+    chosen = np.unique(np.linspace(0, len(data) - 1, min(count, len(data))).astype(int))
+    scale = tile_width / data.image(0).shape[1]
+    sheet = contact_sheet([draw_keypoints(*data[int(i)], scale) for i in chosen], min(columns, len(chosen)))
+    target = out or dataset / "preview.png"
+    write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+    click.echo(str(target))
