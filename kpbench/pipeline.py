@@ -75,7 +75,7 @@ class SynthConfig:
             if not good:
                 raise DataError(what)
 
-        need(self.n >= 1, f"--n is {self.n}, expected a number of images from 1")
+        need(1 <= self.n <= 10**9, f"--n is {self.n}, expected a number of images from 1 to 1,000,000,000")
         need(self.seed >= 0, f"--seed is {self.seed}, expected a whole number from 0")
         need(min(self.size_px) >= 64, f"--size is {self.size_px[0]}x{self.size_px[1]}, expected at least 64x64")
         need(max(self.size_px) <= 16384, f"--size is {self.size_px[0]}x{self.size_px[1]}, at most 16384 a side")

@@ -175,20 +175,17 @@ def _paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """White minus black of each patch as it stands in the image, grey levels, shape (n,).
 
-    The slope of a least-squares line of grey level against the black share of each pixel, weighted by
-    the disc's coverage: unbiased by noise, lowered by blur and shadow. nan where nothing of the patch,
-    or only one of its inks, is in the image.
+    The slope of a least-squares line of grey level against the black share of each pixel that lies
+    wholly on the patch: unbiased by noise, lowered by blur and shadow. nan where nothing of the patch, or
+    only one of its inks, is in the image.
     """
     contrast = np.full(len(masks), np.nan)
     for n, mask in enumerate(masks):
         there, here = _inside(mask.box, image)
         grey = image[there] if image.ndim == 2 else image[there].mean(axis=2)
-        weight = mask.disc[here]
-        share = np.divide(mask.black[here], weight, out=np.zeros_like(weight), where=weight > 1e-9)
-        total = weight.sum()
-        if total > 0:
-            centred = weight * (share - (weight * share).sum() / total)
-            variance = (centred * share).sum()
-            if variance > 1e-9:
-                contrast[n] = -(centred * grey).sum() / variance
+        inside = mask.disc[here] > 1 - 1e-6
+        share, grey = mask.black[here][inside], grey[inside].astype(np.float64)
+        if share.size and np.ptp(share) > 1e-3:
+            centred = share - share.mean()
+            contrast[n] = -(centred @ grey) / (centred @ centred)
     return contrast

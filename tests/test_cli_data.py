@@ -1,0 +1,84 @@
+import subprocess
+import sys
+
+import cv2
+import pytest
+from click.testing import CliRunner
+
+from kpbench.cli import COMMANDS, main
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("made") / "set"
+    result = run("synth", "--n", 6, "--size", "160x120", "--out", folder, "--workers", 1)
+    assert result.exit_code == 0, result.output
+    assert "6 images, 1 shards, fingerprint" in result.stdout
+    return folder
+
+
+def test_inspect_verify_and_preview(dataset, tmp_path):
+    told = run("inspect", dataset)
+    assert told.exit_code == 0
+    assert "6 of 160x120, grey" in told.stdout
+    checked = run("verify", dataset)
+    assert checked.exit_code == 0
+    assert "all as written" in checked.stdout
+    sheet = tmp_path / "sheet.png"
+    assert run("preview", dataset, "--out", sheet, "--count", 4, "--columns", 2, "--tile-width", 160).exit_code == 0
+    assert cv2.imread(str(sheet)).shape == (2 * 124 + 4, 2 * 164 + 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["synth", "--n", "0"], "--n is 0, expected a number of images from 1 to 1,000,000,000"),
+        (["synth", "--n", "-5"], "--n is -5"),
+        (["synth", "--n", "5", "--backgrounds", "nowhere"], "nowhere: no such folder of background images"),
+        (["inspect", "nowhere"], "nowhere: no dataset there"),
+        (["verify", "nowhere"], "nowhere: no dataset there"),
+        (["preview", "nowhere"], "nowhere: no dataset there"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_1(arguments, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result = run(*arguments)
+    assert result.exit_code == 1
+    assert result.stdout == ""
+    assert result.stderr.startswith("kpbench: ")
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_a_second_synth_into_the_folder_changes_nothing(dataset):
+    before = (dataset / "dataset.json").read_bytes()
+    result = run("synth", "--n", 7, "--out", dataset)
+    assert result.exit_code == 1
+    assert "already holds a dataset; add --resume" in result.stderr
+    assert (dataset / "dataset.json").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "arguments", [["synth"], ["synth", "--n", "1", "--size", "big"], ["synth", "--n", "1", "--resume", "--overwrite"]]
+)
+def test_wrong_usage_is_exit_code_2(arguments):
+    assert run(*arguments).exit_code == 2
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(command):
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert "Example" in result.stdout
+    assert f"kpbench {command}" in result.stdout
+
+
+def test_without_a_terminal_stderr_stays_empty(tmp_path):
+    command = [sys.executable, "-m", "kpbench", "synth", "--n", "2", "--size", "160x120", "--out", str(tmp_path / "a")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    assert done.stderr == ""

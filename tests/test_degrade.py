@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kpbench import degrade
+from kpbench.degrade import blur, box_taps, dimming, line_kernel, motion_blur, noise, paper_mix, rain, shadow
+
+
+def picture(channels=1):
+    rng = np.random.default_rng(0)
+    shape = (60, 80) if channels == 1 else (60, 80, 3)
+    return rng.integers(30, 220, shape, dtype=np.uint8)
+
+
+@given(st.floats(1, 31))
+def test_box_taps_are_centred_and_as_wide_as_asked(kernel_px):
+    taps = box_taps(kernel_px)
+    offset = np.arange(len(taps)) - len(taps) // 2
+    assert abs(taps @ offset) < 1e-9
+    assert np.isclose(taps.sum(), 1)
+    assert np.isclose(1 / taps.max(), kernel_px)
+
+
+@given(st.floats(1, 25), st.floats(0, 360))
+def test_motion_kernels_are_centred(length_px, angle_deg):
+    kernel = line_kernel(length_px, angle_deg)
+    reach = len(kernel) // 2
+    assert np.isclose(kernel.sum(), 1)
+    assert abs(kernel.sum(axis=0) @ np.arange(-reach, reach + 1)) < 1e-9
+    assert abs(kernel.sum(axis=1) @ np.arange(-reach, reach + 1)) < 1e-9
+
+
+def test_a_motion_kernel_has_the_length_and_direction_asked_for():
+    kernel = line_kernel(12, 30)
+    y, x = np.mgrid[: len(kernel), : len(kernel)] - len(kernel) // 2
+    along = x * np.cos(np.radians(30)) + y * np.sin(np.radians(30))
+    # variance of a uniform line of length L is L²/12; a pixel adds 1/12 of its own
+    assert np.isclose((kernel * along**2).sum(), 12**2 / 12 + 1 / 12, rtol=0.02)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(
+    "effect",
+    [
+        lambda image: blur(image, 7),
+        lambda image: blur(image, 4),
+        lambda image: motion_blur(image, 9, 33),
+        lambda image: dimming(image, 20),
+        lambda image: noise(image, np.random.default_rng(1), 20),
+        lambda image: shadow(image, 5),
+        lambda image: rain(image, 5),
+        lambda image: paper_mix(image, np.random.default_rng(4))[0],
+    ],
+)
+def test_effects_keep_shape_and_input_and_repeat(effect, channels):
+    image = picture(channels)
+    before = image.copy()
+    result = effect(image)
+    assert result.shape == image.shape
+    assert result.dtype == np.uint8
+    assert (image == before).all()
+    assert (effect(image) == result).all()
+    assert (result != image).any()
+
+
+def test_blur_is_the_mean_of_its_box():
+    image = picture()
+    assert abs(int(blur(image, 7)[30, 40]) - image[27:34, 37:44].mean()) <= 0.5
+
+
+def test_noise_has_the_deviation_asked_for_and_is_seeded():
+    flat = np.full((200, 200), 128, np.uint8)
+    got = noise(flat, np.random.default_rng(0), 15).astype(float)
+    assert abs(got.std() - 15) < 0.2
+    assert abs(got.mean() - 128) < 0.3
+    assert (noise(flat, np.random.default_rng(1), 15) != got).any()
+
+
+def test_dimming_follows_the_law_asked_for():
+    white = np.full((4, 4), 255, np.uint8)
+    assert [int(dimming(white, k)[0, 0]) for k in (10, 20, 30, 40)] == [153, 92, 55, 33]
+    assert [int(dimming(white, k, "literal")[0, 0]) for k in (10, 20)] == [2, 0]  # black, as docs/synth.md says
+
+
+def test_the_paper_mix_records_what_it_did():
+    image = picture()
+    seen = set()
+    for seed in range(60):
+        result, effects = paper_mix(image, np.random.default_rng(seed))
+        assert 1 <= len(effects) <= 3
+        names = [entry["effect"] for entry in effects]
+        assert names == sorted(names, key=list(degrade.FUNCTIONS).index)
+        seen.update(names)
+        if "noise" not in names:
+            assert (degrade.apply(image, np.random.default_rng(0), effects) == result).all()
+    assert seen == {"shadow", "rain", "motion_blur", "blur", "brightness", "noise"}
+
+
+def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch):
+    import os
+
+    degrade._albumentations.cache_clear()
+    monkeypatch.delenv("NO_ALBUMENTATIONS_UPDATE", raising=False)
+    shadow(picture(), 1)
+    assert os.environ["NO_ALBUMENTATIONS_UPDATE"] == "1"

@@ -1,0 +1,145 @@
+import multiprocessing
+
+import cv2
+import numpy as np
+import pytest
+
+from kpbench import store
+from kpbench.errors import DataError
+from kpbench.pipeline import SynthConfig, generate, make_sample
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    rng = np.random.default_rng(0)
+    for n in range(5):
+        cv2.imwrite(str(folder / f"{n}.png"), rng.integers(0, 256, (100, 130), dtype=np.uint8))
+    (folder / "broken.jpg").write_bytes(b"no image")
+    return folder
+
+
+def config(photos, **changes):
+    return SynthConfig(**{"n": 10, "size_px": (160, 120), "backgrounds": photos, "shard_size": 4, **changes})
+
+
+def digests(folder):
+    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir())}
+
+
+def test_neither_workers_nor_an_interruption_change_a_byte(photos, tmp_path):
+    generate(config(photos), tmp_path / "one", workers=1)
+    generate(config(photos), tmp_path / "two", workers=2)
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+
+    class Stop(Exception):
+        pass
+
+    done = 0
+
+    def interrupt(images):
+        nonlocal done
+        done += images
+        if done >= 6:
+            raise Stop
+
+    with pytest.raises(Stop):
+        generate(config(photos), tmp_path / "three", workers=1, progress=interrupt)
+    assert [p.name for p in (tmp_path / "three").iterdir()] == ["shard-00000.h5"]
+    with pytest.raises(DataError, match="holds an unfinished dataset; add --resume"):
+        generate(config(photos), tmp_path / "three", workers=1)
+    run = generate(config(photos), tmp_path / "three", workers=1, resume=True)
+    assert run.kept == 4
+    assert digests(tmp_path / "one") == digests(tmp_path / "three")
+
+
+def test_the_shard_size_changes_no_image(photos, tmp_path):
+    one = generate(config(photos), tmp_path / "one", workers=1).dataset
+    two = generate(config(photos, shard_size=10), tmp_path / "two", workers=1).dataset
+    assert all((one.image(n) == two.image(n)).all() for n in range(10))
+    assert (one.truth.keypoints == two.truth.keypoints).all()
+    assert one.fingerprint != two.fingerprint
+
+
+def test_an_image_depends_on_its_index_and_not_on_n(photos):
+    image = make_sample(config(photos), 7)[0]
+    again = make_sample(config(photos, n=5000), 7)[0]
+    assert (image.image == again.image).all()
+    other = make_sample(config(photos, seed=1), 7)[0]
+    assert (image.image != other.image).any()
+
+
+def test_deterioration_leaves_the_scene_and_lowers_contrast(photos):
+    clean, worn = (make_sample(config(photos, deteriorate=d), 3)[0] for d in ("none", "paper"))
+    assert len(clean.keypoints)
+    for name in clean.keypoints.dtype.names:
+        same = np.array_equal(clean.keypoints[name], worn.keypoints[name])
+        assert same == (name != "contrast")
+    assert clean.effects == []
+    assert worn.effects
+
+
+def test_broken_backgrounds_are_counted_in_the_manifest(photos, tmp_path):
+    run = generate(config(photos, n=20), tmp_path / "set", workers=1)
+    assert run.broken == ("broken.jpg",)
+    assert run.dataset.provenance["broken_backgrounds"] == ["broken.jpg"]
+    assert "broken.jpg" not in {run.dataset._shard(0)["background"].asstr()[0]}
+
+
+def test_another_dataset_in_the_folder_is_kept(photos, tmp_path):
+    generate(config(photos), tmp_path, workers=1)
+    before = digests(tmp_path)
+    for changed in (config(photos, seed=9), config(photos, n=6), config(None)):
+        with pytest.raises(DataError, match="already holds a dataset"):
+            generate(changed, tmp_path, workers=1)
+        with pytest.raises(DataError, match="of another dataset than this command makes"):
+            generate(changed, tmp_path, workers=1, resume=True)
+    assert digests(tmp_path) == before
+    generate(config(photos, n=3), tmp_path, workers=1, overwrite=True)
+    assert sorted(digests(tmp_path)) == ["dataset.json", "shard-00000.h5"]
+
+
+def _hold(folder, config, ready, release):
+    def wait(images):
+        ready.set()
+        release.wait(30)
+
+    generate(config, folder, workers=1, progress=wait)
+
+
+def test_a_second_run_into_one_folder_is_refused(photos, tmp_path):
+    spawn = multiprocessing.get_context("spawn")
+    ready, release = spawn.Event(), spawn.Event()
+    first = spawn.Process(target=_hold, args=(tmp_path, config(photos), ready, release))
+    first.start()
+    try:
+        assert ready.wait(30)
+        with pytest.raises(DataError, match="another kpbench run is writing to it"):
+            generate(config(photos), tmp_path, workers=1)
+    finally:
+        release.set()
+        first.join()
+    assert len(store.open_dataset(tmp_path)) == 10
+
+
+def test_a_disk_too_small_is_told_before_the_start(tmp_path):
+    with pytest.raises(DataError, match=r"need about .* GB, the disk has .* GB free"):
+        generate(config(None, n=10**9, shard_size=10**6), tmp_path / "set", workers=1)
+    assert not any((tmp_path / "set").glob("*"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"n": 0}, "--n is 0"),
+        ({"n": -5}, "--n is -5"),
+        ({"size_px": (10, 480)}, "--size is 10x480"),
+        ({"channels": 2}, "--channels is 2"),
+        ({"shard_size": 0}, "--shard-size is 0"),
+        ({"seed": -1}, "--seed is -1"),
+        ({"deteriorate": "much"}, "--deteriorate is 'much'"),
+    ],
+)
+def test_a_value_out_of_range_is_one_line(changes, says):
+    with pytest.raises(DataError, match=says):
+        config(None, **changes)
