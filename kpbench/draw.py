@@ -111,7 +111,7 @@ def _segments(region: Region, max_deg: float) -> list[list[Line | Arc]]:
 
 def _mm(*values: float) -> str:
     """Numbers to 1 nm, without trailing zeros."""
-    return " ".join(f"{v:.6f}".rstrip("0").rstrip(".").replace("-0", "0", v > -5e-7) for v in values)
+    return " ".join(f"{round(v, 6) + 0.0:.6f}".rstrip("0").rstrip(".") for v in values)
 
 
 def _svg_path(region: Region) -> str:
@@ -225,7 +225,7 @@ def png(page: Page, dpi: float) -> bytes:
     width, height = round(page.width * scale), round(page.height * scale)
     if width * height > MAX_PIXELS:
         raise DesignError(
-            f"a PNG of {page.width:g} x {page.height:g} mm at {dpi:g} dpi is too large; use a lower --dpi"
+            f"{page.width:g} x {page.height:g} mm at {dpi:g} dpi is too large for a PNG; use a lower --dpi"
         )
     paper = np.full((height, width), 255, np.uint8)
 
@@ -254,8 +254,7 @@ def _letters(text: Text, scale: float) -> tuple[NDArray[np.float64], float, floa
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(max(text.size * scale, 1.0))
-    # the built-in font knows ASCII only
-    line = text.clean.replace("×", "x").replace("·", "|").encode("ascii", "replace").decode()
+    line = text.clean.encode("ascii", "replace").decode()  # all that the built-in font knows
     anchor = {"start": "ls", "middle": "ms", "end": "rs"}[text.anchor]
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), line, font, anchor)
     image = Image.new("L", (max(math.ceil(right - left), 1), max(math.ceil(bottom - top), 1)))

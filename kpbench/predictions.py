@@ -8,12 +8,14 @@ arrays. On disk they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl`
 from __future__ import annotations
 
 import csv
+import gc
 import importlib
 import io
 import json
 import math
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
@@ -140,9 +142,7 @@ def _check(p: Predictions) -> None:
     def complain(row: int, name: str, value: object, expected: str) -> NoReturn:
         image = int(np.searchsorted(p.offsets, row, side="right")) - 1
         keypoint = row - int(p.offsets[image])
-        raise _Misfit(
-            image, keypoint, int(p.image_id[image]), f"{name}[{keypoint}] is {value}, expected {expected}"
-        )
+        raise _Misfit(image, keypoint, int(p.image_id[image]), f"{name}[{keypoint}] is {value}, expected {expected}")
 
     if n and p.image_id.min() < 0:
         i = int(np.argmax(p.image_id < 0))
@@ -181,7 +181,8 @@ def read_predictions(path: str | Path) -> Predictions:
             raise PredictionsError(f"unknown kind of predictions file, expected {', '.join(some)} or {last}")
         if path.is_file() and not path.stat().st_size:
             raise PredictionsError("the file is empty")
-        return READERS[path.suffix.lower()](path)
+        with _no_gc():
+            return READERS[path.suffix.lower()](path)
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
     except OSError as error:
@@ -204,6 +205,18 @@ def _read_jsonl(path: Path) -> Predictions:
         header = _header(_parse(file.readline(), "line 1"))
         records = [_parse(line, f"line {n}") for n, line in enumerate(file, 2)]
     return _from_records(records, header, lambda n: f"line {n + 2}")
+
+
+@contextmanager
+def _no_gc() -> Iterator[None]:
+    """Pause the garbage collector, which would walk through millions of new lists again and again."""
+    running = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if running:
+            gc.enable()
 
 
 def _parse(data: bytes, place: str) -> Any:
@@ -247,7 +260,9 @@ def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[i
         image_id.append(record["image_id"])
         points = record.get("keypoints")
         if type(points) is not list:
-            raise PredictionsError(f"{place(n)} (image_id {image_id[-1]}): keypoints is {_kind(points)}, expected a list")
+            raise PredictionsError(
+                f"{place(n)} (image_id {image_id[-1]}): keypoints is {_kind(points)}, expected a list"
+            )
         columns["keypoints"].append(points)
         filled += bool(points)
         for name in given:
@@ -301,19 +316,19 @@ def _record_problem(record: Any) -> str:
 def _first_offender(records: list[Any], place: Callable[[int], str]) -> PredictionsError:
     """The error for the first value of a wrong type or size."""
 
-    def number(value: Any, kinds: set[type]) -> bool:
+    def number(value: Any, kinds: tuple[type, ...]) -> bool:
         return type(value) in kinds and -(2**63) <= value < 2**63 if type(value) is int else type(value) in kinds
 
     for n, record in enumerate(records):
         where = f"{place(n)} (image_id {record['image_id']})"
-        if not number(record["image_id"], {int}):
+        if not number(record["image_id"], (int,)):
             return PredictionsError(f"{where}: image_id is larger than 64 bits hold")
         for k, point in enumerate(record["keypoints"]):
-            if type(point) is not list or len(point) != 2 or not all(number(v, {int, float}) for v in point):
+            if type(point) is not list or len(point) != 2 or not all(number(v, (int, float)) for v in point):
                 return PredictionsError(f"{where}: keypoints[{k}] is {_short(point)}, expected two finite numbers")
         for name, kinds, expected in (
-            ("scores", {int, float}, "a finite number"),
-            ("ids", {int}, "a patch id, 0 or more"),
+            ("scores", (int, float), "a finite number"),
+            ("ids", (int,), "a patch id, 0 or more"),
         ):
             for k, value in enumerate(record.get(name) or []):
                 if not number(value, kinds):
@@ -348,7 +363,8 @@ def _read_csv(path: Path) -> Predictions:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # a row that is too long is only a warning
+            warnings.simplefilter("ignore")  # pandas 3.1 deprecates float_precision, pandas 2 is inexact without
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # a row that is too long is only a warning
             table = pd.read_csv(
                 path,
                 skiprows=skipped,
@@ -368,7 +384,9 @@ def _read_csv(path: Path) -> Predictions:
 def _columns(names: list[str], place: str) -> list[str]:
     names = [name.strip() for name in names]
     if not {"image_id", "x", "y"} <= set(names) <= set(COLUMNS) or len(set(names)) < len(names):
-        raise PredictionsError(f"{place} has columns {','.join(names)[:80]}, expected {','.join(COLUMNS)} (score, id optional)")
+        raise PredictionsError(
+            f"{place} has columns {','.join(names)[:80]}, expected {','.join(COLUMNS)} (score, id optional)"
+        )
     return names
 
 
@@ -419,9 +437,7 @@ def _pyarrow() -> tuple[Any, Any]:
         raise PredictionsError("Parquet needs pyarrow: pip install pyarrow") from None
 
 
-def _from_table(
-    table: dict[str, NDArray[Any]], header: dict[str, Any], place: Callable[[int], str]
-) -> Predictions:
+def _from_table(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
     """Columns from one row a keypoint, in any order; a row with nothing but an image_id is an image without any."""
     values = np.stack([table[name].astype(np.float64) for name in COLUMNS[1:] if name in table], axis=1)
     rows = np.flatnonzero(~np.isnan(values).all(axis=1))
@@ -546,7 +562,7 @@ def _lines(p: Predictions) -> Iterable[bytes]:
 
 def _write_json(p: Predictions) -> bytes:
     head = orjson.dumps(_header_of(p))[:-1]
-    return b"%s,\n \"predictions\": [\n  %s\n ]}\n" % (head, b",\n  ".join(_lines(p)))
+    return b'%s,\n "predictions": [\n  %s\n ]}\n' % (head, b",\n  ".join(_lines(p)))
 
 
 def _write_jsonl(p: Predictions) -> bytes:

@@ -16,18 +16,18 @@ LAYERS = [
     {"errors", "keypoints"},
     {"geometry", "outline", "raster"},
     {"design"},
-    {"background", "board", "draw", "sheet"},
+    {"background", "board", "draw", "sheet", "sidecar", "tiling"},
     {"scene", "degrade", "analysis"},
     {"samples", "camera"},
     {"store", "predictions"},
     {"refine"},
     {"detect"},
     {"score"},
-    {"report", "preview"},
+    {"report", "preview", "interchange"},
     {"pipeline"},
 ]
 EVALUATOR = {"score", "predictions", "report", "detect", "store"}
-GENERATOR = {"design", "scene", "degrade", "background", "board", "draw", "sheet", "analysis", "samples"}
+GENERATOR = {"design", "scene", "degrade", "background", "board", "draw", "sheet", "tiling", "analysis", "samples"}
 TORCH = {"network", "train", "export"}
 
 

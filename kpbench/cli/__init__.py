@@ -19,6 +19,7 @@ COMMANDS = {
     "inspect": ("data:inspect", "Say what is in a dataset."),
     "verify": ("data:verify", "Check every byte of a dataset."),
     "preview": ("data:preview", "Draw a contact sheet with the true keypoints."),
+    "export": ("data:export", "Write a dataset as COCO, YOLO-pose or WebDataset."),
     "detect": ("detecting:detect", "Run a detector over a dataset or image files."),
     "score": ("scoring:score", "Score a predictions file with the paper's metrics."),
     "demo": ("demo:demo", "The whole chain, small, in about a minute."),

@@ -8,7 +8,7 @@ import click
 
 from kpbench.cli.options import SIZE
 
-__all__ = ["inspect", "preview", "synth", "verify"]
+__all__ = ["export", "inspect", "preview", "synth", "verify"]
 
 DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
 
@@ -175,3 +175,23 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     target = out or dataset / "preview.png"
     write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
     click.echo(str(target))
+
+
+@click.command()
+@DATASET
+@click.option("--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True)
+@click.option("--out", type=click.Path(path_type=Path), help="New folder; default: DATASET-FORMAT.")
+def export(dataset: Path, form: str, out: Path | None) -> None:
+    """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
+
+    \b
+    Example:
+      kpbench export kpbench-data --format coco
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.interchange import export_dataset
+    from kpbench.store import open_dataset
+
+    data = open_dataset(dataset)
+    with progress_bar(len(data), "export") as progress:
+        click.echo(str(export_dataset(data, form, out or Path(f"{dataset}-{form}"), progress)))

@@ -1,0 +1,130 @@
+"""``kpbench render-patches``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import click
+
+
+class Measured(click.ParamType[tuple[float, float]]):
+    """``X_MM,Y_MM`` as a tuple."""
+
+    name = "X_MM,Y_MM"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        try:
+            x, y = (float(part) for part in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is no pair of lengths, expected X_MM,Y_MM such as 99.8,100.1", param, ctx)
+        return x, y
+
+
+@click.command("render-patches")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("patches-print"), show_default=True, help="Folder."
+)
+@click.option("--pdf", is_flag=True, help="Vector PDF that asks the viewer not to scale (default).")
+@click.option("--svg", is_flag=True, help="SVG in mm with true arcs.")
+@click.option("--png", is_flag=True, help="8-bit grey PNG with its resolution.")
+@click.option("--dxf", is_flag=True, help="DXF in mm with true arcs, for laser and plotter.")
+@click.option(
+    "--diameter-mm",
+    type=click.FloatRange(0.1, 5000),
+    help="Diameter of the disc; rim and quiet zone come on top. A hexagon's side is DIAMETER / 0.16.  [default: 30]",
+)
+@click.option("--page", default="a4", show_default=True, help="a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
+@click.option("--landscape", is_flag=True, help="Turn the page.")
+@click.option("--dpi", type=click.IntRange(36, 4800), default=600, show_default=True, help="Resolution of PNG.")
+@click.option("--board", metavar="hexagon|grid|FILE.toml", help="A board instead of patches to cut out.")
+@click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over pages.")
+@click.option(
+    "--design", "designs", type=click.Path(path_type=Path), multiple=True, help="Your own design (TOML); repeatable."
+)
+@click.option("--patch", "chosen", multiple=True, metavar="NAME|ID", help="Only this design; repeatable.")
+@click.option(
+    "--copies", type=click.IntRange(1, 10_000), default=1, show_default=True, help="Of each patch to cut out."
+)
+@click.option("--mirror", is_flag=True, help="Swap left and right, for transfer film.")
+@click.option("--no-labels", is_flag=True, help="No text; rulers and cut marks stay.")
+@click.option(
+    "--measured",
+    type=Measured(),
+    help="Lengths of the two rulers on the paper: corrects the sidecars in --out, prints nothing anew.",
+)
+@click.pass_context
+def render_patches(
+    ctx: click.Context,
+    out: Path,
+    pdf: bool,
+    svg: bool,
+    png: bool,
+    dxf: bool,
+    diameter_mm: float | None,
+    page: str,
+    landscape: bool,
+    dpi: int,
+    board: str | None,
+    tile: bool,
+    designs: tuple[Path, ...],
+    chosen: tuple[str, ...],
+    copies: int,
+    mirror: bool,
+    no_labels: bool,
+    measured: tuple[float, float] | None,
+) -> None:
+    """Print the patches or a board, true to scale.
+
+    Writes ./patches-print/patches.pdf, and beside it patches.json with the position of every
+    keypoint. Print at 100 %, then measure the two rulers on the paper.
+
+    \b
+    Examples:
+      kpbench render-patches --pdf
+      kpbench render-patches --svg --dxf --diameter-mm 50 --design my-patch.toml
+      kpbench render-patches --board hexagon --patch checker
+      kpbench render-patches --board hexagon --diameter-mm 60 --tile
+      kpbench render-patches --measured 99.8,100.1
+    """
+    from tqdm import tqdm
+
+    from kpbench.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
+    from kpbench.design import load_patches, shipped_patches
+    from kpbench.sheet import board_sheet, parse_paper, patch_sheet, save_sheet
+    from kpbench.sidecar import correct_sidecars
+
+    given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
+    if measured is not None:
+        if given - {"measured", "out"}:
+            raise click.UsageError("--measured corrects what is in --out and takes no other option.")
+        for path in correct_sidecars(out, measured):
+            click.echo(path)
+        return
+    if board is None and tile:
+        raise click.UsageError("--tile spreads a board; give --board.")
+    if board is not None and "copies" in given:
+        raise click.UsageError("--copies is for patches to cut out, not for a --board.")
+    if board not in (None, "hexagon", "grid") and chosen:
+        raise click.UsageError("--patch does not go with a board file, which names its patches itself.")
+
+    paper = parse_paper(page, landscape, labels=not no_labels, mirrored=mirror)
+    diameter = 30.0 if diameter_mm is None else diameter_mm
+    own = load_patches(designs) if designs else None
+    patches = shipped_patches() if own is None else own
+    if chosen:
+        patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
+    if board is None:
+        sheets = [patch_sheet(patches, diameter, paper, copies)]
+    elif board == "hexagon":
+        boards = [hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in patches]
+        sheets = [board_sheet(b, paper, tile) for b in boards]
+    elif board == "grid":
+        sheets = [board_sheet(grid_board(patches, 4, 3, diameter, GRID_PITCH * diameter), paper, tile)]
+    else:
+        sheets = [board_sheet(load_board(board, own, diameter_mm), paper, tile)]
+    suffixes = [s for s, wanted in {".pdf": pdf, ".svg": svg, ".png": png, ".dxf": dxf}.items() if wanted]
+    for one in tqdm(sheets, disable=not (png and sys.stderr.isatty()), leave=False):
+        for path in save_sheet(one, out, suffixes or [".pdf"], dpi):
+            click.echo(path)
+    click.echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)

@@ -1,0 +1,203 @@
+"""The reference detector: SuperPoint's raw heads from an ONNX file, decoded here in NumPy and OpenCV.
+
+The graph gives logits a cell of 8x8 px. :func:`decode` turns them into keypoints: one probability map
+at full resolution, its local maxima, and for each maximum the centre of mass of the probability around
+it, whichever cells that lies in.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.errors import DataError
+from kpbench.keypoints import Detections, Float, UInt8
+
+__all__ = ["Decoding", "SuperPointDetector", "decode", "pad_to_cells", "to_grey"]
+
+CELL = 8
+SCHEMA = "kpbench.superpoint/1"
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Decoding:
+    """How logits become keypoints.
+
+    Attributes
+    ----------
+    threshold : float
+        Least probability that a keypoint lies in the window around a maximum, in [0, 1].
+    separation_px : int
+        Of two maxima closer than this the weaker one is dropped. Discs that do not overlap and whose
+        short axes measure 10 px have their centres at least so far apart.
+    window_px : int
+        Reach of the window that is summed up, and averaged for the sub-pixel position: it is
+        ``2 · window_px + 1`` wide.
+    """
+
+    threshold: float = 0.5
+    separation_px: int = 6
+    window_px: int = 3
+
+
+def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | None = None) -> Detections:
+    """Keypoints from the two heads of one image.
+
+    Parameters
+    ----------
+    detector_logits : ndarray of shape (65, h, w), float32
+        A pixel of the cell each, in row order, then "no keypoint".
+    id_logits : ndarray of shape (ids + 1, h, w), float32
+        A patch each, then "no patch".
+    decoding : Decoding, optional
+
+    Returns
+    -------
+    Detections
+        In the frame of the (8h, 8w) image, best first; ``patch_id`` is the place of the patch in the ID head.
+    """
+    how = decoding or Decoding()
+    probability = keypoint_probability(detector_logits)
+    reach = how.window_px
+    # a light smoothing ranks neighbours within a blob, so that one blob has one maximum
+    ranked = cv2.GaussianBlur(probability, (0, 0), 1.0, borderType=cv2.BORDER_CONSTANT)
+    mass = cv2.boxFilter(probability, -1, (2 * reach + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+    side = 2 * how.separation_px - 1
+    highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
+    rows, columns = np.nonzero((ranked >= highest) & (mass >= how.threshold))
+    if not len(rows):
+        return Detections.none()
+    padded = np.pad(probability, reach)
+    offset = np.arange(2 * reach + 1)
+    windows = padded[rows[:, None, None] + offset[:, None], columns[:, None, None] + offset]
+    total = windows.sum(axis=(1, 2))
+    x = columns + windows.sum(axis=1) @ (offset - reach) / total
+    y = rows + windows.sum(axis=2) @ (offset - reach) / total
+    xy = np.column_stack([x, y])
+    score = np.minimum(total, 1.0).astype(np.float64)
+    order = np.lexsort((x, y, -score))
+    order = order[_apart(xy[order], how.separation_px)]
+    ids = np.argmax(_at(id_logits, xy[order])[:, :-1], axis=1)
+    return Detections(xy[order], score[order], ids)
+
+
+def keypoint_probability(detector_logits: Float32) -> Float32:
+    """Softmax over each cell, laid out as an image: (65, h, w) to (8h, 8w)."""
+    _, h, w = detector_logits.shape
+    share = np.exp(detector_logits - detector_logits.max(axis=0))
+    share = share[:-1] / share.sum(axis=0)
+    return np.ascontiguousarray(share.reshape(CELL, CELL, h, w).transpose(2, 0, 3, 1).reshape(CELL * h, CELL * w))
+
+
+def _apart(xy: Float, distance: float) -> NDArray[np.int64]:
+    """Indices of the points that have no better (earlier) kept one within ``distance``."""
+    kept: list[int] = []
+    for n, point in enumerate(xy):
+        if not kept or np.min(np.hypot(*(xy[kept] - point).T)) >= distance:
+            kept.append(n)
+    return np.array(kept, np.int64)
+
+
+def _at(cells: Float32, xy: Float) -> Float:
+    """Bilinear values of a cell map at pixels: (C, h, w) and (n, 2) to (n, C); cell centres at 3.5 + 8i px."""
+    _, h, w = cells.shape
+    u = np.clip((xy - (CELL - 1) / 2) / CELL, 0, (w - 1, h - 1))
+    low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
+    (fx, fy), (j, i) = (u - low).T, low.T
+    j1, i1 = np.minimum(j + 1, w - 1), np.minimum(i + 1, h - 1)
+    top = cells[:, i, j] * (1 - fx) + cells[:, i, j1] * fx
+    bottom = cells[:, i1, j] * (1 - fx) + cells[:, i1, j1] * fx
+    return np.asarray((top * (1 - fy) + bottom * fy).T)
+
+
+def to_grey(image: UInt8) -> UInt8:
+    """(H, W) or RGB (H, W, 3) to (H, W).
+
+    Raises
+    ------
+    DataError
+        If the array is no such image.
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def pad_to_cells(grey: UInt8) -> UInt8:
+    """Repeat the last row and column until both sides are multiples of 8; (0, 0) stays where it is."""
+    height, width = grey.shape
+    return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
+
+
+Refine = Callable[[UInt8, Detections], Detections]
+"""Moves detections in a grey image to a better place, e.g. by fitting the design."""
+
+
+@dataclass
+class SuperPointDetector:
+    """SuperPoint on ONNX Runtime; call it with an image.
+
+    Attributes
+    ----------
+    path : Path
+        ONNX file written by ``kpbench export-model``.
+    decoding : Decoding
+    refine : callable, optional
+        Applied last, to the grey image and the detections.
+    threads : int
+        Threads of ONNX Runtime; 0 leaves the choice to it.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read or was not written by kpbench.
+    """
+
+    path: Path
+    decoding: Decoding = field(default_factory=Decoding)
+    refine: Refine | None = None
+    threads: int = 0
+
+    def __post_init__(self) -> None:
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = self.threads
+        options.log_severity_level = 3
+        try:
+            data = Path(self.path).read_bytes()
+            self._session: Any = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+            self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+            content = json.loads(self.metadata.get("kpbench", "{}"))
+        except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
+            raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
+        if content.get("schema") != SCHEMA:
+            raise DataError(f"{self.path}: not written by kpbench export-model, expected schema {SCHEMA!r} inside")
+        self.content: dict[str, Any] = content
+        self._patch_ids = np.array([p["id"] for p in content["patches"]], np.int64)
+
+    def __call__(self, image: UInt8) -> Detections:
+        """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
+        grey = to_grey(image)
+        blob = np.float32(1 / 255) * pad_to_cells(grey)[None, None]
+        detector, ids = self._session.run(None, {"image": blob})
+        found = decode(detector[0], ids[0], self.decoding)
+        height, width = grey.shape
+        inside = np.all((found.xy > -0.5) & (found.xy < (width - 0.5, height - 0.5)), axis=1)
+        found = found[inside]
+        found = Detections(found.xy, found.score, self._patch_ids[found.patch_id])
+        return found if self.refine is None else self.refine(grey, found)
+
+    detect = __call__
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0][:200] if str(error) else type(error).__name__

@@ -1,0 +1,500 @@
+"""Training samples made on the fly: a batch is a function of (config, seed, index) and of nothing else.
+
+Two kinds: ``scenes`` are whole images as ``kpbench synth`` writes them; ``crops`` are small windows
+with patches, boards of patches and look-alikes in them, made a batch at a time, several hundred a second
+on one core, with degradations whose strength the training loop raises.
+
+Keypoints that no detector could find, because blur or noise has buried them, are marked to be ignored:
+they are neither to be found nor to be left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench import degrade
+from kpbench.background import PhotoFolder, procedural
+from kpbench.design import Patch, unit_polygons
+from kpbench.keypoints import Float, UInt8
+from kpbench.raster import Box, box_around, coverage
+from kpbench.scene import Limits, random_placements, render_scene
+
+__all__ = ["Batch", "SampleConfig", "load_photos", "make_batch"]
+
+Float32 = NDArray[np.float32]
+
+MOST_KEYPOINTS = 12
+IMAGE_WIDTH_PX = 640  # the image that a crop is thought to be cut from: focal lengths are relative to it
+DETECTABLE = 12.0
+"""Least contrast / noise · √area of a keypoint that is asked for: 6 σ at the output of a matched filter."""
+
+
+@dataclass(frozen=True)
+class SampleConfig:
+    """What the training sees.
+
+    Attributes
+    ----------
+    kind : str
+        "crops" or "scenes", see the module.
+    size : (int, int)
+        Width and height of a sample, px, multiples of 8.
+    set_size : int
+        Scenes only: how many different scenes there are; sample i shows scene i modulo this.
+    """
+
+    kind: str = "crops"
+    size: tuple[int, int] = (96, 96)
+    set_size: int = 20_000
+
+
+class Batch(NamedTuple):
+    """Images (B, H, W) uint8, and keypoints (B, K, 4) float32.
+
+    A keypoint is x, y (px), place of its patch in the design set (−1: there is none) and ignore radius
+    (px): 0 for one that is to be found; else nothing is asked for within that distance.
+    """
+
+    images: UInt8
+    keypoints: Float32
+
+
+def load_photos(folder: str | Path | None, keep: slice = slice(None)) -> list[UInt8]:
+    """All photographs of a folder in grey, in the order of their names; broken ones are left out.
+
+    Parameters
+    ----------
+    folder : path or None
+        None gives 64 procedural textures.
+    keep : slice
+        Which of the files to take.
+
+    Raises
+    ------
+    DataError
+        As :meth:`kpbench.background.PhotoFolder.open`.
+    """
+    if folder is None:
+        return [procedural(np.random.default_rng([2410, n]), 640, 480) for n in range(64)]
+    photos = PhotoFolder.open(folder)
+    read = (cv2.imread(str(photos.path / name), cv2.IMREAD_GRAYSCALE) for name in photos.files[keep])
+    return [_at_most(image) for image in read if image is not None]
+
+
+def _at_most(image: NDArray[np.uint8], side: int = 640) -> UInt8:
+    scale = side / max(image.shape)
+    if scale < 1:
+        image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+    return image
+
+
+def make_batch(
+    config: SampleConfig,
+    patches: Sequence[Patch],
+    photos: Sequence[UInt8],
+    seed: int,
+    index: int,
+    count: int,
+    severity: float,
+) -> Batch:
+    """The ``count`` samples of batch ``index``.
+
+    Parameters
+    ----------
+    config : SampleConfig
+    patches : sequence of Patch
+    photos : sequence of ndarray of shape (H, W), uint8
+    seed, index : int
+    count : int
+    severity : float
+        0: clean images; 1: the full range of degradations.
+    """
+    rng = np.random.default_rng([seed, index])
+    if config.kind == "scenes":
+        return _scenes(config, patches, photos, rng, seed, index * count, count, severity)
+    return _crops(config, patches, photos, rng, count, severity)
+
+
+def _scenes(
+    config: SampleConfig,
+    patches: Sequence[Patch],
+    photos: Sequence[UInt8],
+    rng: np.random.Generator,
+    seed: int,
+    first: int,
+    count: int,
+    severity: float,
+) -> Batch:
+    width, height = config.size
+    images = np.zeros((count, height, width), np.uint8)
+    keypoints = _no_keypoints(count)
+    for n in range(count):
+        fixed = np.random.default_rng([seed, 1, (first + n) % config.set_size])
+        background = _window(photos[fixed.integers(len(photos))], fixed, width, height)
+        rendered = render_scene(background, random_placements(fixed, width, height, patches, Limits()))
+        image = degrade.paper_mix(rendered.image, rng)[0] if rng.random() < severity else rendered.image
+        images[n] = image
+        for k, row in enumerate(rendered.keypoints[:MOST_KEYPOINTS]):
+            keypoints[n, k] = row["x"], row["y"], [p.patch_id for p in patches].index(row["patch_id"]), 0.0
+    return Batch(images, keypoints)
+
+
+def _no_keypoints(count: int) -> Float32:
+    keypoints = np.zeros((count, MOST_KEYPOINTS, 4), np.float32)
+    keypoints[..., 2] = -1
+    return keypoints
+
+
+# Crops -------------------------------------------------------------------------------------------------
+
+
+class Disc(NamedTuple):
+    """One patch that is to be drawn into a crop; ``place`` is its place in the design set."""
+
+    patch: Patch
+    place: int
+    H_patch2image: Float
+    x: float
+    y: float
+    major: float
+    minor: float
+    black: float
+    white: float
+
+
+def _crops(
+    config: SampleConfig,
+    patches: Sequence[Patch],
+    photos: Sequence[UInt8],
+    rng: np.random.Generator,
+    count: int,
+    severity: float,
+) -> Batch:
+    width, height = config.size
+    images = np.zeros((count, height, width), np.uint8)
+    keypoints = _no_keypoints(count)
+    discs: list[list[Disc]] = []
+    canvases: list[UInt8] = []
+    for _ in range(count):
+        image = _background(photos, rng, width, height)
+        if rng.random() < 0.5:
+            _distract(image, rng)
+        drawn = _lay_out(rng, patches, image)
+        discs.append(drawn)
+        canvases.append(image)
+    _paint_all(canvases, discs)
+    for n in range(count):
+        radius = min((d.minor for d in discs[n]), default=20.0)
+        image, gain, kernel, sigma = _degrade(canvases[n], rng, severity, radius)
+        images[n] = image
+        inside = [d for d in discs[n] if -0.5 <= d.x < width - 0.5 and -0.5 <= d.y < height - 0.5]
+        for k, disc in enumerate(inside[:MOST_KEYPOINTS]):
+            kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
+            signal = gain * (disc.white - disc.black) * max(kept, 0.0) * np.sqrt(np.pi * disc.major * disc.minor)
+            lost = signal < DETECTABLE * sigma or disc.minor < 0.5 * Limits().minor_axis_px
+            keypoints[n, k] = disc.x, disc.y, disc.place, disc.major if lost else 0.0
+    return Batch(images, keypoints)
+
+
+def _window(photo: UInt8, rng: np.random.Generator, width: int, height: int, least: float = 0.5) -> UInt8:
+    """A crop of a photograph, at between ``least`` and all of its size, mirrored half of the time."""
+    rows, columns = photo.shape
+    largest = min(columns / width, rows / height)
+    scale = largest * np.exp(rng.uniform(np.log(least), 0.0))
+    w, h = max(8, int(width * scale)), max(8, int(height * scale))
+    x, y = rng.integers(columns - w + 1), rng.integers(rows - h + 1)
+    how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    image = cv2.resize(photo[y : y + h, x : x + w], (width, height), interpolation=how)
+    return np.ascontiguousarray(image[:, ::-1] if rng.random() < 0.5 else image, np.uint8)
+
+
+def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
+    """Mostly photographs, of any contrast and brightness; now and then an even surface."""
+    if rng.random() < 0.08:
+        return np.full((height, width), rng.integers(256), np.uint8)
+    image = _window(photos[rng.integers(len(photos))], rng, width, height, least=0.1)
+    if rng.random() < 0.5:
+        middle = rng.uniform(60, 200)
+        table = np.clip(middle + rng.uniform(0.4, 1.6) * (np.arange(256) - 127.0), 0, 255).astype(np.uint8)
+        image = np.asarray(cv2.LUT(image, table), np.uint8)
+    return image
+
+
+def random_poses(rng: np.random.Generator, count: int, limits: Limits) -> Float:
+    """Homographies of :func:`kpbench.scene.random_placements`, many at a time, keypoint at (0, 0).
+
+    Returns
+    -------
+    ndarray of shape (count, 3, 3)
+        H_patch2image; H[:, 2, 2] = 1.
+    """
+    found: list[Float] = []
+    missing = count
+    while missing > 0:
+        n = 2 * missing + 8
+        focal = IMAGE_WIDTH_PX * np.exp(rng.uniform(*np.log(limits.focal), n))
+        (cx, cy), (sx, sy) = np.cos(a := np.radians(rng.uniform(-1, 1, (2, n)) * limits.tilt_deg)), np.sin(a)
+        cz, sz = np.cos(b := rng.uniform(0, 2 * np.pi, n)), np.sin(b)
+        radius = np.exp(rng.uniform(*np.log(limits.radius_px), n))
+        x, y = rng.uniform(-0.5, 0.5, n) * IMAGE_WIDTH_PX, rng.uniform(-0.375, 0.375, n) * IMAGE_WIDTH_PX
+        H = np.empty((n, 3, 3))
+        # columns of Rx @ Ry @ Rz (geometry.rotation_xyz), times K with its principal point at (0, 0)
+        H[:, 0, 0], H[:, 0, 1], H[:, 0, 2] = radius * cy * cz, -radius * cy * sz, x
+        H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = radius * (cx * sz + sx * sy * cz), radius * (cx * cz - sx * sy * sz), y
+        H[:, 2, 0], H[:, 2, 1] = radius / focal * (sx * sz - cx * sy * cz), radius / focal * (sx * cz + cx * sy * sz)
+        H[:, 2, 2] = 1.0
+        H[:, 0] -= x[:, None] * H[:, 2]
+        H[:, 1] -= y[:, None] * H[:, 2]
+        _, major, minor = ellipses(H)
+        good = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
+        found.append(H[good][:missing])
+        missing -= len(found[-1])
+    return np.concatenate(found) if found else np.zeros((0, 3, 3))
+
+
+def ellipses(H: Float) -> tuple[Float, Float, Float]:
+    """Centres (n, 2) and semi-axes (n,) of projected unit discs; nan where one reaches the horizon."""
+    dual = H @ np.diag([1.0, 1.0, -1.0]) @ H.transpose(0, 2, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dual = np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan)
+        x, y = dual[:, 0, 2], dual[:, 1, 2]
+        xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
+        half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+        return np.column_stack([x, y]), np.sqrt(half + spread), np.sqrt(np.maximum(half - spread, 0.0))
+
+
+def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -> list[Disc]:
+    """Choose the patches of one crop; draw the paper below them into the image, if there is any."""
+    height, width = image.shape
+    limits = Limits()
+    on_board = rng.random() < 0.5
+    asked = int(rng.choice(5, p=(0.15, 0.4, 0.2, 0.15, 0.1)))
+    if asked == 0:
+        if on_board:
+            _paper(image, rng, random_poses(rng, 1, limits)[0] + _shift(rng.uniform(0, width), rng.uniform(0, height)))
+        return []
+    poses = random_poses(rng, 1 if on_board else asked, limits)
+    # centres may lie a little outside: what remains of such a patch is no keypoint
+    at = rng.uniform(-0.1, 1.1, (len(poses), 2)) * (width, height) - 0.5
+    poses[:, :2] += at[:, :, None] * poses[:, 2:]
+    if on_board:
+        first = poses[0]
+        _paper(image, rng, first)
+        # a hexagon of circumradius 0.36 S for patches of diameter 0.16 S; other boards are tighter or looser
+        ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
+        corners = turn + np.arange(6) * np.pi / 3
+        offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array([np.cos(turn), np.sin(turn)])
+        steps = np.tile(np.eye(3), (6, 1, 1))
+        steps[:, :2, 2] = offsets
+        turns = np.zeros((6, 3, 3))
+        spin = rng.uniform(0, 2 * np.pi, 6) if rng.random() < 0.5 else np.zeros(6)
+        turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1] = np.cos(spin), -np.sin(spin), np.sin(spin), np.cos(spin)
+        turns[:, 2, 2] = 1.0
+        poses = first @ steps @ turns
+        poses = poses[poses[:, 2, 2] > 0.2]
+        poses /= poses[:, 2:, 2:]
+    centres, majors, minors = ellipses(poses)
+    alike = rng.random() < 0.5
+    which = rng.integers(len(patches), size=len(poses))
+    black = rng.uniform(*limits.black, len(poses))
+    white = rng.uniform(*limits.white, len(poses))
+    if on_board:
+        black[:], white[:] = black[0], white[0]
+        if alike:
+            which[:] = which[0]
+    discs: list[Disc] = []
+    for n, H in enumerate(poses):
+        patch = patches[which[n]]
+        (x, y), reach = centres[n], patch.extent * majors[n]
+        seen = -reach < x < width + reach and -reach < y < height + reach and majors[n] < 4 * width
+        apart = all(np.hypot(x - d.x, y - d.y) > reach + d.patch.extent * d.major for d in discs)
+        if seen and apart:
+            discs.append(Disc(patch, int(which[n]), H, H[0, 2], H[1, 2], majors[n], minors[n], black[n], white[n]))
+    return discs
+
+
+def _shift(x: float, y: float) -> Float:
+    return np.array([[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
+
+
+def _paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
+    """A sheet in the plane of the patches: mostly lighter than the white ink, some of it grey or dark."""
+    grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
+    low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
+    corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T
+    if np.all(corners[:, 2] > 0.05):
+        points = np.clip(corners[:, :2] / corners[:, 2:], -4000, 4000)
+        cv2.fillConvexPoly(image, np.round(points * 16).astype(np.int32), grey, cv2.LINE_AA, 4)
+
+
+def _distract(image: UInt8, rng: np.random.Generator) -> None:
+    """Draw what may be taken for a patch: discs, rings, half-discs, chequers, polygons, letters, bars."""
+    height, width = image.shape
+    for _ in range(rng.integers(1, 4)):
+        x, y = rng.uniform(0, 1, 2) * (width, height)
+        radius = np.exp(rng.uniform(np.log(4), np.log(40)))
+        dark, light = rng.uniform(0, 120), rng.uniform(150, 255)
+        if rng.random() < 0.5:
+            dark, light = light, dark
+        angle = rng.uniform(0, 360)
+        ratio = rng.uniform(0.4, 1.0)
+        centre = (int(x * 16), int(y * 16))
+        axes = (int(radius * 16), int(radius * ratio * 16))
+        kind = rng.integers(7)
+        if kind == 0:  # disc
+            cv2.ellipse(image, centre, axes, angle, 0, 360, dark, -1, cv2.LINE_AA, 4)
+        elif kind == 1:  # rings
+            for part in np.linspace(1, 0, rng.integers(2, 5), endpoint=False):
+                inner = (int(axes[0] * part), int(axes[1] * part))
+                cv2.ellipse(image, centre, inner, angle, 0, 360, dark, -1, cv2.LINE_AA, 4)
+                dark, light = light, dark
+        elif kind == 2:  # a disc of one edge: half black, half white
+            cv2.ellipse(image, centre, axes, angle, 0, 360, light, -1, cv2.LINE_AA, 4)
+            cv2.ellipse(image, centre, axes, angle, 0, 180, dark, -1, cv2.LINE_AA, 4)
+        elif kind == 3:  # chequers: their corners look like patches, but have neighbours
+            _chequers(image, rng, dark, light)
+        elif kind == 4:  # triangle or quadrangle
+            corner_angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 5)))
+            points = np.column_stack([x + radius * np.cos(corner_angles), y + radius * np.sin(corner_angles)])
+            cv2.fillPoly(image, [np.round(points * 16).astype(np.int32)], dark, cv2.LINE_AA, 4)
+        elif kind == 5:  # letters
+            text = "".join(chr(c) for c in rng.integers(48, 91, rng.integers(1, 5)))
+            size = float(radius / 20)
+            place = (int(x - radius), int(y + radius / 2))
+            cv2.putText(image, text, place, int(rng.integers(8)), size, dark, int(rng.integers(1, 4)), cv2.LINE_AA)
+        else:  # a bar or a line
+            c, s = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
+            thick = int(rng.integers(1, 8))
+            cv2.line(image, (int(x - 3 * c), int(y - 3 * s)), (int(x + 3 * c), int(y + 3 * s)), dark, thick, cv2.LINE_AA)
+
+
+def _chequers(image: UInt8, rng: np.random.Generator, dark: float, light: float) -> None:
+    rows, columns = rng.integers(3, 8, 2)
+    side = int(np.exp(rng.uniform(np.log(4), np.log(18))))
+    board = np.kron(np.indices((rows, columns)).sum(axis=0) % 2, np.ones((side, side)))
+    texture = np.where(board > 0, dark, light).astype(np.uint8)
+    angle = rng.uniform(0, 2 * np.pi)
+    A = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([1.0, rng.uniform(0.5, 1.0)])
+    shift = rng.uniform(0, 1, 2) * image.shape[::-1] - A @ (np.array(texture.shape[::-1]) / 2)
+    M = np.column_stack([A, shift])
+    size = (image.shape[1], image.shape[0])
+    mask = cv2.warpAffine(np.full_like(texture, 255), M, size, flags=cv2.INTER_LINEAR)
+    drawn = cv2.warpAffine(texture, M, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    np.copyto(image, drawn, where=mask > 127)
+
+
+@lru_cache(maxsize=64)
+def _stacked_polygons(patch: Patch, tolerance: float) -> tuple[Float, tuple[int, ...], int]:
+    """All vertices of (black, disc) in homogeneous coordinates, where to cut them, and the number of black ones."""
+    black, disc = unit_polygons(patch, tolerance)
+    points = np.concatenate([*black, *disc])
+    cuts = np.cumsum([len(p) for p in (*black, *disc)])[:-1]
+    return np.column_stack([points, np.ones(len(points))]), tuple(cuts.tolist()), len(black)
+
+
+def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
+    """Draw the patches of a whole batch with one call of the rasteriser."""
+    regions: list[Sequence[Float]] = []
+    boxes: list[Box] = []
+    for disc in (d for row in discs for d in row):
+        # edges true to 1/64 px: cheaper than in a benchmark image, and still below what noise leaves
+        stacked, cuts, black_count = _stacked_polygons(disc.patch, 2.0 ** np.floor(np.log2(1 / 64 / disc.major)))
+        mapped = stacked @ disc.H_patch2image.T
+        polygons = np.split(mapped[:, :2] / mapped[:, 2:], cuts)
+        regions += [polygons[:black_count], polygons[black_count:]]
+        boxes += [box_around(polygons[black_count:])] * 2
+    covers = coverage(regions, boxes)
+    n = 0
+    for image, row in zip(canvases, discs, strict=True):
+        for disc in row:
+            _paint(image, boxes[n], covers[n], covers[n + 1], disc.black, disc.white)
+            n += 2
+
+
+def _paint(image: UInt8, box: Box, black_cover: Float, disc_cover: Float, black: float, white: float) -> None:
+    x, y, w, h = box
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
+    if x0 >= x1 or y0 >= y1:
+        return
+    here = slice(y0 - y, y1 - y), slice(x0 - x, x1 - x)
+    part = image[y0:y1, x0:x1]
+    disc = disc_cover[here]
+    part[:] = np.rint(part * (1.0 - disc) + white * disc - (white - black) * black_cover[here])
+
+
+def _degrade(
+    image: UInt8, rng: np.random.Generator, severity: float, radius: float
+) -> tuple[UInt8, float, float, float]:
+    """Light, blur, noise, compression; returns (image, gain, kernel width in px, noise in grey levels)."""
+    gain, kernel, sigma = 1.0, 0.0, 0.6  # rounding, and what a sensor adds at best
+    work = image.astype(np.float32)
+    if rng.random() < 0.3 * severity:
+        work, factor = _shade(work, rng)
+        gain *= factor
+    if rng.random() < 0.6 * severity + 0.2:
+        work, kernel = _soften(work, rng, severity, radius)
+    draw = rng.random()
+    if draw < 0.35 * severity:  # the dimming ladder reaches 0.6^4
+        factor = 0.6 ** rng.uniform(0.0, 4.3)
+        work *= np.float32(factor)
+        gain *= factor
+        if rng.random() < 0.3:  # low light: photons, then read noise
+            photons = rng.uniform(1.0, 8.0)
+            level = np.maximum(work, 0.0) * np.float32(photons)
+            work += rng.standard_normal(work.shape, dtype=np.float32) * np.sqrt(level) / np.float32(photons)
+            sigma += float(np.sqrt(work.mean().clip(0) / photons))
+    elif draw < 0.5 * severity:
+        factor = rng.uniform(0.4, 1.5)
+        offset = rng.uniform(-40, 40)
+        work = work * np.float32(factor) + np.float32(offset)
+        gain *= min(factor, 1.0)
+    draw = rng.random()
+    if draw < 0.75:
+        strong = draw < 0.35 * severity
+        added = rng.uniform(5, 70) * severity if strong else np.exp(rng.uniform(np.log(0.5), np.log(6.0)))
+        work += rng.standard_normal(work.shape, dtype=np.float32) * np.float32(added)
+        sigma += added
+    result = np.clip(np.rint(work), 0, 255).astype(np.uint8)
+    if rng.random() < 0.25 * severity:
+        quality = int(rng.uniform(25, 95))
+        coded = cv2.imencode(".jpg", result, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
+        result = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+        sigma += (100 - quality) / 15
+    return result, gain, kernel, sigma
+
+
+def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
+    """A shadow with one straight border, sharp or soft, or a slope of light across the image."""
+    height, width = work.shape
+    angle = rng.uniform(0, 2 * np.pi)
+    x = (np.arange(width, dtype=np.float32) - np.float32(rng.uniform(0, width))) * np.float32(np.cos(angle))
+    y = (np.arange(height, dtype=np.float32) - np.float32(rng.uniform(0, height))) * np.float32(np.sin(angle))
+    ramp = np.clip((y[:, None] + x) / np.float32(np.exp(rng.uniform(0, np.log(width)))) + 0.5, 0, 1)
+    factor = rng.uniform(0.2, 0.9)
+    return work * (1 - np.float32(1 - factor) * ramp), factor
+
+
+def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
+    """One of four blurs, no wider than what leaves something of a patch of this radius."""
+    widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
+    width = float(rng.uniform(1.0, max(widest, 1.5)))
+    kind = rng.integers(4)
+    if kind == 0:
+        taps = degrade.box_taps(width)
+        return cv2.sepFilter2D(work, -1, taps, taps, borderType=degrade.BORDER), width  # type: ignore[return-value]
+    if kind == 1:  # a Gaussian of the box's standard deviation
+        return cv2.GaussianBlur(work, (0, 0), width / np.sqrt(12)), width  # type: ignore[return-value]
+    if kind == 2:
+        line = degrade.line_kernel(round(1.5 * width), float(rng.integers(0, 180)))
+        return cv2.filter2D(work, -1, line, borderType=degrade.BORDER), width  # type: ignore[return-value]
+    side = np.arange(-int(width / 2 + 1), int(width / 2 + 1) + 1)
+    disc = np.clip(width / 2 + 0.5 - np.hypot(side, side[:, None]), 0, 1)
+    return cv2.filter2D(work, -1, disc / disc.sum(), borderType=degrade.BORDER), width  # type: ignore[return-value]

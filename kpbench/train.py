@@ -1,0 +1,744 @@
+"""Training: one loop over samples that are made on the fly, resumable to the bit.
+
+A recipe is a TOML file (:func:`load_recipe`). Progress is counted in samples, so that a recipe says the
+same on one processor and on eight accelerators. A checkpoint is one safetensors file with the weights,
+their running mean, the optimizer's moments and, as JSON, the recipe and the number of steps; batches are
+a function of (recipe, seed, step), hence nothing else is needed to go on as if nothing had happened.
+
+Under ``torchrun`` each process takes every n-th batch and gradients are averaged; nothing else differs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import threading
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+import cv2
+import numpy as np
+import torch
+import torch.distributed as dist
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torch.utils.data import DataLoader, Dataset
+
+from kpbench import __version__
+from kpbench.design import Patch, shipped_patches
+from kpbench.detectors.superpoint import decode
+from kpbench.errors import DataError
+from kpbench.keypoints import UInt8
+from kpbench.network import CELL, NetworkConfig, SuperPoint, initialise, read_weights
+from kpbench.samples import Batch, SampleConfig, load_photos, make_batch
+from kpbench.store import canonical_json, write_atomic
+
+__all__ = ["Loss", "Phase", "Recipe", "designs_digest", "evaluate", "load_recipe", "read_checkpoint", "train"]
+
+SCHEMA = "kpbench.checkpoint/1"
+VALIDATION_EVERY = 10
+"""Of a folder of photographs every tenth is kept for validation."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What is minimised: detector + ``identity_weight`` · identity.
+
+    Attributes
+    ----------
+    place : str
+        Where in its cells a keypoint is asked for: "pixel" (the nearest one, as SuperPoint) or "split"
+        (shared out to the four around it by distance, across cell borders, so that the mean of the
+        distribution is the keypoint).
+    positive_weight : float
+        Weight of a cell that holds a keypoint, relative to one that holds none.
+    focal : float
+        Exponent of the focal loss (Lin et al., ICCV 2017) on "is there a keypoint in this cell"; 0: none.
+    identity : str
+        "entropy": cross-entropy over patches and "no patch" at cells within 8 px of a keypoint and beyond
+        16 px of all; "hinge": SuperPoint's descriptor loss against the one-hot map of every cell, where
+        cells of one class are no negatives of each other.
+    identity_weight : float
+    lambda_d, positive_margin, negative_margin : float
+        Of the hinge loss (Table 1).
+    """
+
+    place: str = "split"
+    positive_weight: float = 1.0
+    focal: float = 0.0
+    identity: str = "entropy"
+    identity_weight: float = 0.2
+    lambda_d: float = 640 * 480 / 5
+    positive_margin: float = 0.9
+    negative_margin: float = 0.2
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the training: how many samples, which weights learn, how strong degradations grow."""
+
+    samples: int
+    trains: str = "all"  # or "attached"
+    severity: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that a training is a function of, besides photographs, designs and initial weights.
+
+    Attributes
+    ----------
+    name : str
+    phases : tuple of Phase
+    batch : samples a step, over all processes.
+    optimizer : "adam" (weight decay as L2, as in the paper) or "adamw".
+    lr, weight_decay : float
+    warmup : samples over which the learning rate rises from 0.
+    schedule : "step" (times ``decay`` at each of ``decay_at``) or "cosine" (down to ``decay`` at the end).
+    ema : decay of the running mean of the weights a step; the mean is what is evaluated and exported.
+    precision : "bf16" (autocast) or "fp32".
+    compile : whether to use ``torch.compile``.
+    """
+
+    name: str
+    phases: tuple[Phase, ...]
+    seed: int = 0
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    samples: SampleConfig = field(default_factory=SampleConfig)
+    loss: Loss = field(default_factory=Loss)
+    batch: int = 64
+    optimizer: str = "adamw"
+    lr: float = 1e-3
+    weight_decay: float = 1e-4
+    warmup: int = 0
+    schedule: str = "cosine"
+    decay: float = 0.05
+    decay_at: tuple[int, ...] = ()
+    ema: float = 0.999
+    precision: str = "bf16"
+    compile: bool = False
+
+    @property
+    def steps(self) -> int:
+        return sum(p.samples for p in self.phases) // self.batch
+
+    def phase(self, step: int) -> tuple[Phase, float]:
+        """The phase at a step, and the severity of degradations there."""
+        at = step * self.batch
+        for phase in self.phases:
+            if at < phase.samples:
+                break
+            at -= phase.samples
+        low, high = phase.severity
+        return phase, low + (high - low) * min(at / phase.samples, 1.0)
+
+    def rate(self, step: int) -> float:
+        """The learning rate at a step."""
+        at = step * self.batch
+        warm = min((at + self.batch) / self.warmup, 1.0) if self.warmup else 1.0
+        if self.schedule == "step":
+            return self.lr * warm * self.decay ** sum(at >= a for a in self.decay_at)
+        done = min(step / max(self.steps, 1), 1.0)
+        return self.lr * warm * (self.decay + (1 - self.decay) * 0.5 * (1 + np.cos(np.pi * done)))
+
+
+T = TypeVar("T")
+CHOICES = {
+    "place": ("pixel", "split"),
+    "identity": ("entropy", "hinge"),
+    "trains": ("all", "attached"),
+    "optimizer": ("adam", "adamw"),
+    "schedule": ("step", "cosine"),
+    "precision": ("bf16", "fp32"),
+    "kind": ("crops", "scenes"),
+}
+
+
+def load_recipe(path: str | Path) -> Recipe:
+    """Read a training recipe.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: not valid TOML ({error})") from None
+    return _parse(Recipe, table, str(path), "")
+
+
+def _parse(cls: type[T], table: Any, source: str, place: str) -> T:
+    """A dataclass from its table, nested ones too; the types of the fields say what is expected."""
+    if not isinstance(table, Mapping):
+        raise DataError(f"{source}: {place or 'the recipe'} is {table!r}, expected a table")
+    hints = get_type_hints(cls)
+    values = {}
+    for key, value in table.items():
+        where = f"{place}.{key}" if place else key
+        if key not in hints:
+            raise DataError(f"{source}: unknown key {where}; known are: {', '.join(hints)}")
+        values[key] = _value(hints[key], value, source, where)
+        if key in CHOICES and value not in CHOICES[key]:
+            raise DataError(f"{source}: {where} is {value!r}, expected one of: {', '.join(CHOICES[key])}")
+    missing = [f.name for f in fields(cls) if f.name in ("name", "phases", "samples") and f.name not in values]  # type: ignore[arg-type]
+    try:
+        return cls(**values)
+    except TypeError:
+        raise DataError(f"{source}: {place or 'the recipe'} lacks {' and '.join(missing)}") from None
+    except DataError as error:
+        raise DataError(f"{source}: {error}") from None
+
+
+def _value(kind: Any, value: Any, source: str, where: str) -> Any:
+    if is_dataclass(kind):
+        return _parse(kind, value, source, where)  # type: ignore[arg-type]
+    if get_origin(kind) is tuple:
+        args = get_args(kind)
+        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
+            count = "" if args[-1] is Ellipsis else f"{len(args)} "
+            raise DataError(f"{source}: {where} is {value!r}, expected a list of {count}values")
+        return tuple(_value(args[0], v, source, f"{where}[{n}]") for n, v in enumerate(value))
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise DataError(f"{source}: {where} is {value!r}, expected {kind.__name__}")
+    if kind is not bool and kind is not str and value < 0:
+        raise DataError(f"{source}: {where} is {value!r}, expected a number from 0")
+    return kind(value)
+
+
+# Losses ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What is asked of each cell.
+
+    Attributes
+    ----------
+    place : Tensor of shape (B, 65, h, w): probabilities, sum 1.
+    asked : Tensor of shape (B, h, w): 0 where a keypoint is ignored, else 1.
+    identity : Tensor of shape (B, h, w), int64: patch, or ``ids`` for none.
+    near, far : Tensor of shape (B, h, w), bool: within 8 px of a keypoint; beyond 16 px of all.
+    """
+
+    place: Tensor
+    asked: Tensor
+    identity: Tensor
+    near: Tensor
+    far: Tensor
+
+
+def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: str) -> Targets:
+    """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.samples.Batch`) on images of that size."""
+    count, h, w = len(keypoints), height // CELL, width // CELL
+    xy, patch, ignore = keypoints[..., :2], keypoints[..., 2], keypoints[..., 3]
+    wanted = (patch >= 0) & (ignore == 0)
+
+    low = torch.floor(xy if place == "split" else xy + 0.5)
+    part = xy - low if place == "split" else torch.zeros_like(xy)
+    image = torch.zeros(count, height * width, device=keypoints.device)
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        x, y = (low[..., 0] + dx).long(), (low[..., 1] + dy).long()
+        share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
+        share = share * (wanted & (x >= 0) & (y >= 0) & (x < width) & (y < height))
+        image.scatter_add_(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1), share)
+    pixels = image.view(count, h, CELL, w, CELL).permute(0, 2, 4, 1, 3).reshape(count, CELL * CELL, h, w)
+    mass = pixels.sum(1, keepdim=True)
+    pixels = pixels / mass.clamp(min=1.0)
+    target = torch.cat([pixels, (1 - mass).clamp(min=0.0)], 1)
+
+    rows = torch.arange(h, device=keypoints.device) * CELL + (CELL - 1) / 2
+    columns = torch.arange(w, device=keypoints.device) * CELL + (CELL - 1) / 2
+    distance = torch.hypot(xy[:, :, 0, None, None] - columns, xy[:, :, 1, None, None] - rows[:, None])  # (B, K, h, w)
+    buried = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL / 2)).any(1)
+    asked = ~buried | (mass[:, 0] > 0)
+    nearest, which = distance.masked_fill(~wanted[..., None, None], float("inf")).min(1)
+    near = nearest <= CELL
+    identity = patch.long().gather(1, which.flatten(1)).view_as(which)
+    return Targets(
+        target, asked.float(), torch.where(near, identity, ids), near, (nearest > 2 * CELL) & ~buried
+    )
+
+
+def losses(detector: Tensor, ids: Tensor, targets: Targets, config: Loss) -> tuple[Tensor, Tensor]:
+    """(detector loss, identity loss) of raw head outputs (B, 65, h, w) and (B, ids + 1, h, w)."""
+    log_p = F.log_softmax(detector.float(), 1)
+    entropy = -(targets.place * log_p).sum(1)
+    mass = 1 - targets.place[:, -1]
+    weight = targets.asked * (1 + (config.positive_weight - 1) * mass)
+    if config.focal:
+        empty = log_p[:, -1].exp()
+        weight = weight * (mass * empty + (1 - mass) * (1 - empty)).detach() ** config.focal
+    located = (weight * entropy).sum() / targets.asked.sum().clamp(min=1.0)
+    hinge = _hinge if config.identity == "hinge" else _cross_entropy
+    return located, hinge(ids.float(), targets, config)
+
+
+def _cross_entropy(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+    entropy = F.cross_entropy(ids, targets.identity, reduction="none")
+    near, far = targets.near, targets.far
+    return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
+
+
+def _hinge(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+    """SuperPoint's descriptor loss (its eq. 4-6) of one image against the map of one-hot vectors.
+
+    The sum over pairs of cells is grouped by the class of the second cell: the dot product with a
+    one-hot vector is one channel of the normalised descriptor.
+    """
+    inside = targets.place[:, -1] < 1  # the class of a cell is the patch whose keypoint lies in it
+    identity = torch.where(inside, targets.identity, ids.shape[1] - 1)
+    dots = F.normalize(ids, dim=1).flatten(2)  # (B, C, cells)
+    onehot = F.one_hot(identity.flatten(1), ids.shape[1]).permute(0, 2, 1).float()
+    population = onehot.sum(2, keepdim=True)
+    positive = (onehot * F.relu(config.positive_margin - dots)).sum((1, 2)) * config.lambda_d
+    negative = ((1 - onehot) * population * F.relu(dots - config.negative_margin)).sum((1, 2))
+    return ((positive + negative) / dots.shape[2] ** 2).mean()
+
+
+# State and checkpoints ---------------------------------------------------------------------------------
+
+
+@dataclass
+class State:
+    """What changes while training."""
+
+    recipe: Recipe
+    network: SuperPoint
+    mean: SuperPoint  # exponential moving average of ``network``
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+
+
+def designs_digest(patches: Sequence[Patch]) -> str:
+    """SHA-256 over the designs, in their order: which network output means which ink."""
+    return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
+
+
+def start(recipe: Recipe, device: torch.device) -> State:
+    """A fresh network, its weights a function of the recipe's seed alone."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        network = SuperPoint(recipe.network)
+        mean = SuperPoint(recipe.network)
+    network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    mean.to(device, memory_format=torch.channels_last).requires_grad_(False).eval()  # type: ignore[call-overload]
+    mean.load_state_dict(network.state_dict())
+    kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
+    optimizer = kind(
+        network.parameters(), lr=recipe.lr, weight_decay=recipe.weight_decay, fused=device.type == "cuda" or None
+    )
+    return State(recipe, network, mean, optimizer)
+
+
+def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
+    """Write all of the state to one safetensors file, whole or not at all."""
+    from safetensors.torch import save
+
+    tensors = {f"network.{k}": v for k, v in state.network.state_dict().items()}
+    tensors |= {f"mean.{k}": v for k, v in state.mean.state_dict().items()}
+    for name, parameter in state.network.named_parameters():
+        for key, value in state.optimizer.state.get(parameter, {}).items():
+            tensors[f"optimizer.{key}.{name}"] = value
+    content = {
+        "schema": SCHEMA,
+        "recipe": asdict(state.recipe),
+        "step": state.step,
+        "seconds": round(state.seconds, 1),
+        "patches": [{"id": p.patch_id, "name": p.name, "digest": p.digest} for p in patches],
+        "designs": designs_digest(patches),
+        "versions": {"kpbench": __version__, "torch": torch.__version__},
+    }
+    packed = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+    write_atomic(path, save(packed, {"kpbench": json.dumps(content)}))
+
+
+def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """(content, tensors) of a checkpoint.
+
+    Raises
+    ------
+    DataError
+        If the file is no checkpoint of this version.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, framework="pt") as file:
+            content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError, ValueError) as error:
+        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error).splitlines()[0]})") from None
+    if content.get("schema") != SCHEMA:
+        raise DataError(f"{path}: no checkpoint of kpbench train, expected schema {SCHEMA!r} inside")
+    return content, tensors
+
+
+def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
+    """Put a checkpoint into a freshly started state.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, or belongs to another recipe or other designs.
+    """
+    content, tensors = read_checkpoint(path)
+    theirs, ours = content["recipe"], json.loads(json.dumps(asdict(state.recipe)))
+    changed = [key for key in ours if ours[key] != theirs.get(key)]
+    if changed:
+        raise DataError(f"{path}: was trained with another {' and '.join(changed)}; use another folder with --out")
+    if content["designs"] != designs_digest(patches):
+        raise DataError(f"{path}: was trained on other patch designs; use another folder with --out")
+
+    def part(name: str) -> dict[str, Tensor]:
+        return {key.removeprefix(name): value for key, value in tensors.items() if key.startswith(name)}
+
+    state.network.load_state_dict(part("network."))
+    state.mean.load_state_dict(part("mean."))
+    moments = part("optimizer.")
+    for name, parameter in state.network.named_parameters():
+        own = {key: moments[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in moments}
+        if own:
+            like = torch.empty_like(parameter)  # keeps the memory format, on which rounding may depend
+            on_device = {key: value if key == "step" else like.clone().copy_(value) for key, value in own.items()}
+            if parameter.device.type == "cuda":
+                on_device["step"] = on_device["step"].to(parameter.device)
+            state.optimizer.state[parameter] = on_device
+    state.step, state.seconds = content["step"], content["seconds"]
+
+
+# The loop ----------------------------------------------------------------------------------------------
+
+
+class Batches(Dataset[Batch]):
+    """Batch ``n`` of this process at index ``n``, for a DataLoader's workers."""
+
+    def __init__(self, recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], rank: int, world: int) -> None:
+        self.recipe, self.patches, self.photos, self.rank, self.world = recipe, patches, photos, rank, world
+
+    def __getitem__(self, step: int) -> Batch:
+        cv2.setNumThreads(1)
+        recipe, _ = self.recipe, None
+        _, severity = recipe.phase(step)
+        index, count = step * self.world + self.rank, recipe.batch // self.world
+        return make_batch(recipe.samples, self.patches, self.photos, recipe.seed, index, count, severity)
+
+
+def _batches(data: Batches, first: int, workers: int, pin: bool) -> Iterator[tuple[Tensor, Tensor]]:
+    loader: Any = DataLoader(
+        data,
+        batch_size=None,
+        sampler=range(first, data.recipe.steps),
+        num_workers=workers,
+        prefetch_factor=4 if workers else None,
+        pin_memory=pin,
+    )
+    for images, keypoints in loader:
+        yield torch.as_tensor(images), torch.as_tensor(keypoints)
+
+
+def step_once(state: State, forward: nn.Module, images: Tensor, keypoints: Tensor, world: int) -> tuple[Tensor, Tensor]:
+    """One step of the optimizer; (detector loss, identity loss)."""
+    recipe, network = state.recipe, state.network
+    phase, _ = recipe.phase(state.step)
+    network.requires_grad_(phase.trains == "all")
+    for parameter in network.attached:
+        parameter.requires_grad_(True)
+    network.train(phase.trains == "all")  # a frozen trunk keeps its BatchNorm statistics too
+    for group in state.optimizer.param_groups:
+        group["lr"] = recipe.rate(state.step)
+
+    height, width = images.shape[-2:]
+    device = images.device
+    blob = (images.float() / 255)[:, None].contiguous(memory_format=torch.channels_last)
+    with torch.autocast(device.type, torch.bfloat16, enabled=recipe.precision == "bf16"):
+        detector, ids = forward(blob)
+    targets = make_targets(keypoints, height, width, recipe.network.ids, recipe.loss.place)
+    located, identified = losses(detector, ids, targets, recipe.loss)
+    state.optimizer.zero_grad(set_to_none=True)
+    (located + recipe.loss.identity_weight * identified).backward()  # type: ignore[no-untyped-call]
+    if world > 1:
+        _average_gradients(network, world)
+    state.optimizer.step()
+    _follow(state)
+    state.step += 1
+    return located.detach(), identified.detach()
+
+
+def _average_gradients(network: nn.Module, world: int) -> None:
+    """Mean over all processes, as one message."""
+    gradients = [p.grad for p in network.parameters() if p.grad is not None]
+    flat = torch.cat([g.flatten() for g in gradients])
+    dist.all_reduce(flat)
+    flat /= world
+    for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+        gradient.copy_(part.view_as(gradient))
+
+
+@torch.no_grad()
+def _follow(state: State) -> None:
+    """Move the running mean towards the weights; faster at first, when there is little to remember."""
+    decay = min(state.recipe.ema, (1 + state.step) / (10 + state.step))
+    mine, theirs = state.mean.state_dict(), state.network.state_dict()
+    real = [k for k in mine if mine[k].is_floating_point()]
+    torch._foreach_lerp_([mine[k] for k in real], [theirs[k] for k in real], 1 - decay)
+
+
+@contextlib.contextmanager
+def _stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """Let Ctrl-C and SIGTERM end the loop after the step in hand; yields "was there one?"."""
+    seen = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield seen.is_set
+        return
+    before = {s: signal.signal(s, lambda *_: seen.set()) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield seen.is_set
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def train(
+    recipe: Recipe,
+    out: str | Path,
+    backgrounds: str | Path | None = None,
+    *,
+    init: str | Path | None = None,
+    resume_run: bool = False,
+    minutes: float | None = None,
+    workers: int = 1,
+    threads: int | None = None,
+    save_every: float = 5.0,
+    validate_every: float = 15.0,
+    tensorboard: bool = False,
+    patches: Sequence[Patch] | None = None,
+    say: Callable[[str], None] = lambda line: None,
+) -> bool:
+    """Train, or go on training; writes ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    out : path
+    backgrounds : path, optional
+        Folder of photographs; every tenth is kept for validation. None: procedural textures.
+    init : path, optional
+        Published SuperPoint weights to start from, see :func:`kpbench.network.initialise`.
+    resume_run : bool
+        Go on from the checkpoint in ``out``.
+    minutes : float, optional
+        Stop after this time; the rest of the recipe can be trained later.
+    workers : int
+        Processes that make samples; 0: none but this one.
+    threads : int, optional
+        Threads of torch.
+    save_every, validate_every : float
+        Minutes between checkpoints, and between validations.
+    tensorboard : bool
+        Write the log for TensorBoard too.
+    patches : sequence of Patch, optional
+        The designs, one a channel of the ID head; None: the shipped ones.
+    say : callable
+        Receives lines for the user.
+
+    Returns
+    -------
+    bool
+        Whether the recipe is finished.
+
+    Raises
+    ------
+    DataError
+        On anything that does not fit: recipe, checkpoint, folder, initial weights.
+    KeyboardInterrupt
+        After a checkpoint, if a signal ended the loop.
+    """
+    began = time.monotonic()
+    rank, world, device = _place()
+    if threads:
+        torch.set_num_threads(threads)
+    designs = tuple(patches or shipped_patches())
+    if len(designs) != recipe.network.ids:
+        raise DataError(f"the network tells {recipe.network.ids} patches apart, but there are {len(designs)} designs")
+    if recipe.batch % world or recipe.batch < world:
+        raise DataError(f"batch is {recipe.batch}, expected a multiple of the {world} processes")
+    folder = Path(out)
+    checkpoint = folder / "checkpoint.safetensors"
+    if not resume_run and checkpoint.exists():
+        raise DataError(f"{checkpoint}: there is a training in this folder; use --resume, or another folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    state = start(recipe, device)
+    if resume_run:
+        resume(state, checkpoint, designs)
+    elif init is not None:
+        say(initialise(state.network, read_weights(init), str(init)))
+        state.mean.load_state_dict(state.network.state_dict())
+    photos = load_photos(backgrounds)
+    held_out = photos[::VALIDATION_EVERY] if len(photos) > 1 else photos
+    seen = [p for n, p in enumerate(photos) if n % VALIDATION_EVERY] or photos
+    validation = validation_set(recipe, designs, held_out) if rank == 0 else None
+    forward: nn.Module = torch.compile(state.network) if recipe.compile else state.network  # type: ignore[assignment]
+
+    with _recorder(folder, rank == 0, tensorboard) as record, _bar(state, rank) as advance, _stop_on_signal() as signalled:
+        saved = validated = noted = time.monotonic()
+        before, first = state.seconds, state.step
+        sums, since = torch.zeros(2, device=device), state.step
+        data = Batches(recipe, designs, seen, rank, world)
+        for images, keypoints in _batches(data, state.step, workers, device.type == "cuda"):
+            pair = step_once(state, forward, images.to(device), keypoints.to(device), world)
+            sums += torch.stack(pair)
+            now = time.monotonic()
+            state.seconds = before + now - began
+            stop = _agree(signalled() or (minutes is not None and now - began > 60 * minutes), world, device)
+            if now - noted > 20 or stop or state.step == recipe.steps:
+                located, identified = (sums / (state.step - since)).tolist()
+                rate = (state.step - first) * recipe.batch / (now - began)
+                advance(state.step, f"{located:.4f} {identified:.4f}")
+                record(state, {"loss": located, "id_loss": identified, "lr": recipe.rate(state.step), "samples_s": rate})
+                sums.zero_()
+                noted, since = now, state.step
+            last = stop or state.step == recipe.steps
+            if validation and (last or now - validated > 60 * validate_every):
+                record(state, evaluate(state.mean, validation))
+                validated = time.monotonic()
+            if rank == 0 and (last or now - saved > 60 * save_every):
+                save_checkpoint(state, checkpoint, designs)
+                saved = time.monotonic()
+            if stop:
+                break
+        interrupted = signalled()
+    if interrupted:
+        raise KeyboardInterrupt(f"{checkpoint} is at step {state.step}; the same command with --resume goes on")
+    return state.step >= recipe.steps
+
+
+def _place() -> tuple[int, int, torch.device]:
+    """(rank, processes, device) as ``torchrun`` says in the environment, else one process."""
+    rank, world = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
+    cuda = torch.cuda.is_available()
+    device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")
+    if cuda:
+        torch.cuda.set_device(device)
+        torch.backends.cudnn.benchmark = True
+    if world > 1 and not dist.is_initialized():
+        dist.init_process_group("nccl" if cuda else "gloo")
+    return rank, world, device
+
+
+def _agree(stop: bool, world: int, device: torch.device) -> bool:
+    """Whether any process wants to stop: all must leave the loop at the same step."""
+    if world == 1:
+        return stop
+    flag = torch.tensor(float(stop), device=device)
+    dist.all_reduce(flag)
+    return bool(flag.item())
+
+
+Record = Callable[[State, Mapping[str, Any]], None]
+
+
+@contextlib.contextmanager
+def _recorder(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
+    """Append to ``log.jsonl``, and to TensorBoard's files if asked for."""
+    if not active:
+        yield lambda state, figures: None
+        return
+    writer: Any = None
+    if tensorboard:
+        from torch.utils.tensorboard import SummaryWriter
+
+        writer = SummaryWriter(folder)  # type: ignore[no-untyped-call]
+    with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
+
+        def record(state: State, figures: Mapping[str, Any]) -> None:
+            rounded = {k: float(f"{v:.5g}") for k, v in figures.items()}
+            at = {"step": state.step, "samples": state.step * state.recipe.batch, "minutes": round(state.seconds / 60, 2)}
+            log.write(json.dumps(at | rounded) + "\n")
+            log.flush()
+            for key, value in figures.items() if writer else ():
+                writer.add_scalar(key, value, at["samples"])
+
+        yield record
+    if writer:
+        writer.close()
+
+
+@contextlib.contextmanager
+def _bar(state: State, rank: int) -> Iterator[Callable[[int, str], None]]:
+    """A progress bar over samples with the time left; only on a terminal."""
+    import sys
+
+    from tqdm import tqdm
+
+    batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
+    hidden = rank != 0 or not sys.stderr.isatty()
+    with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
+
+        def advance(step: int, text: str) -> None:
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(step * batch - bar.n)
+
+        yield advance
+
+
+# Validation --------------------------------------------------------------------------------------------
+
+Validation = list[tuple[str, Batch]]
+
+
+def validation_set(recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], count: int = 32) -> Validation:
+    """Whole images, clean and with the paper's deteriorations, and crops at full severity; fixed by the seed."""
+    scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
+    crops = replace(recipe.samples, kind="crops", size=(128, 128))
+    seed = recipe.seed + 2**31  # away from all training batches
+    return [
+        ("clean", make_batch(scenes, patches, photos, seed, 0, count, 0.0)),
+        ("paper", make_batch(scenes, patches, photos, seed, 0, count, 1.0)),
+        ("hard", make_batch(crops, patches, photos, seed, 1, 8 * count, 1.0)),
+    ]
+
+
+@torch.inference_mode()
+def evaluate(network: SuperPoint, validation: Validation) -> dict[str, float]:
+    """Share of keypoints found within 3 px and within 1 px, right IDs among the former, false alarms an image."""
+    network.eval()
+    device = next(network.parameters()).device
+    figures: dict[str, float] = {}
+    for name, batch in validation:
+        truths = found = close = right = alarms = 0
+        for image, keypoints in zip(batch.images, batch.keypoints, strict=True):
+            blob = torch.as_tensor(image, device=device).float()[None, None] / 255
+            detector, ids = network(blob)
+            detections = decode(detector[0].float().cpu().numpy(), ids[0].float().cpu().numpy())
+            explained = np.zeros(len(detections), bool)
+            for x, y, patch, ignore in keypoints[keypoints[:, 2] >= 0]:
+                distance = np.hypot(*(detections.xy - (x, y)).T)
+                explained |= distance <= max(3.0, ignore)
+                if ignore:
+                    continue
+                truths += 1
+                if len(distance) and distance.min() <= 3.0:
+                    found += 1
+                    close += bool(distance.min() <= 1.0)
+                    right += bool(detections.patch_id is not None and detections.patch_id[distance.argmin()] == patch)
+            alarms += int(np.sum(~explained))
+        figures |= {
+            f"{name}_found_3px": found / max(truths, 1),
+            f"{name}_found_1px": close / max(truths, 1),
+            f"{name}_id": right / max(found, 1),
+            f"{name}_alarms": alarms / len(batch.images),
+        }
+    return figures
