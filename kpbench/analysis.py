@@ -1,20 +1,8 @@
 """How good a design is: localisation, look-alikes among designs and in nature, pixels needed.
 
-A design is a polar chequer, so its image is *linear* in its inks: the image of every cell is rendered
-once for each attitude (exact area coverage), and a design's image, its derivatives and its correlations
-with other designs are matrix products with its vector of inks. That is what makes it cheap to measure a
-whole family (:mod:`kpbench.search`).
-
-Conventions
------------
-* An *attitude* is a 2x2 matrix from the unit disc to px, rotation and foreshortening; perspective within
-  one patch is left out (a patch is small), except by :func:`tilt_bias`.
-* Inks are 1 for black and 0 for white; distances are root mean squares in units of the ink contrast, so
-  that 0.1 at a contrast of 180 grey levels is a difference of 18 grey levels a pixel.
-* What is *seen* is always a disc of :data:`SEEN_PX` radius. If it is a fraction ``seen`` of the patch, the
-  patch is larger and only its inner part is looked at: a detector knows neither the scale nor the rim.
-* Blur is Gaussian, its standard deviation a fraction of the seen radius. Beyond the disc the outermost
-  ring goes on, so that no distance is owed to a background.
+Distances are root mean squares in units of the ink contrast: 0.1 at a contrast of 180 grey levels is a
+difference of 18 grey levels a pixel, which is what noise has to hide. See :mod:`kpbench.cells` for how
+designs are rendered, blurred and seen.
 """
 
 from __future__ import annotations
@@ -24,195 +12,53 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from kpbench.cells import (
+    BLUR,
+    DIRECTIONS_DEG,
+    HALF,
+    MARGIN,
+    SEEN_PX,
+    TILTS_DEG,
+    TURNS,
+    Float32,
+    Grid,
+    attitudes,
+    blurred,
+    images,
+    moments,
+    seen_cells,
+    window_weights,
+)
 from kpbench.design import Patch
 from kpbench.geometry import Camera, plane_to_camera, projected_disc, rotation_xyz
 from kpbench.keypoints import Float, UInt8
-from kpbench.raster import box_around, coverage
 
 __all__ = [
+    "STEPS",
     "Analysis",
     "Bound",
     "DesignReport",
-    "Grid",
     "analyse",
     "basin",
     "bound",
     "correlation_and_distance",
+    "disc_bound",
     "natural_response",
     "pixels_needed",
     "sample_windows",
     "symmetry_order",
     "tilt_bias",
+    "turned_distance",
 ]
 
 NOISE, CONTRAST = 10.0, 180.0  # grey levels
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
-TILTS_DEG = (0.0, 30.0, 60.0)
-DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # of the tilt, in the image
-TURNS = 24  # rotations in the plane that are compared, 15 degrees apart
-SEEN_PX = 5.0
-BLUR = 0.2
 SEEN_BASIN = (1.0, 1 / 2, 1 / 3)
 SEEN_IDENTITY = (1.0, 3 / 4)
 SHIFT = 0.25  # of the seen radius
 LOOKS_ALIKE = (0.8, 0.9)  # correlations
 WINDOWS = 20_000
-HALF = int(SEEN_PX) + 1
-
-Float32 = NDArray[np.float32]
-
-
-# --- Cells and their images ---------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A polar chequer that several designs fit on.
-
-    Attributes
-    ----------
-    radii : tuple of float
-        Outer radii of the rings, ascending, in disc radii.
-    angles_deg : tuple of float
-        Borders of the sectors, ascending, in [0, 360).
-    """
-
-    radii: tuple[float, ...]
-    angles_deg: tuple[float, ...]
-
-    @classmethod
-    def of(cls, patches: Sequence[Patch]) -> Grid:
-        """The coarsest grid on which all the designs fit."""
-        radii = np.unique(np.round(np.concatenate([p.cells[0][1:] for p in patches]), 9))
-        angles = np.unique(np.round(np.concatenate([p.cells[1] for p in patches]), 9))
-        if len(angles) < 3:  # cells must be narrower than half a turn
-            angles = np.unique(np.concatenate([angles, [0.0, 90.0, 180.0, 270.0]]))
-        return cls(tuple(radii.tolist()), tuple(angles.tolist()))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Rings, sectors."""
-        return len(self.radii), len(self.angles_deg)
-
-    def _middles(self) -> tuple[Float, Float]:
-        radii, angles = np.append(0.0, self.radii), np.array(self.angles_deg)
-        return (radii[1:] + radii[:-1]) / 2, (angles + np.append(angles[1:], angles[0] + 360.0)) / 2
-
-    def inks(self, patches: Sequence[Patch]) -> Float32:
-        """Inks of the designs, shape (n, cells), ring by ring; a patch that ends early keeps its outer ring's inks."""
-        radius, angle = self._middles()
-        rows = []
-        for patch in patches:
-            at = np.minimum(radius, patch.extent - 1e-6)[:, None, None]
-            turned = np.radians(angle)[None, :, None]
-            rows.append(patch.is_black(np.concatenate([at * np.cos(turned), at * np.sin(turned)], -1)).ravel())
-        return np.array(rows, np.float32)
-
-    def cells(self, tolerance: float, reach: float = 0.0) -> list[Float]:
-        """Every cell as a polygon of the patch frame; the outermost ring reaches to ``reach`` at least.
-
-        Neighbours share the vertices of their common border, so that cells of one ink add up without a
-        seam. ``tolerance`` is in disc radii, see :func:`kpbench.outline.flatten`.
-        """
-        radii = np.append(0.0, self.radii)
-        radii[-1] = max(radii[-1], reach)
-        polygons = []
-        ends = np.append(self.angles_deg[1:], self.angles_deg[0] + 360.0)
-        for inner, outer in zip(radii[:-1], radii[1:], strict=True):
-            for start, end in zip(self.angles_deg, ends, strict=True):
-                near, far = _arc(inner, start, end, tolerance), _arc(outer, start, end, tolerance)
-                polygons.append(np.concatenate([far, near[::-1]]))
-        return polygons
-
-
-def _arc(radius: float, start_deg: float, end_deg: float, tolerance: float) -> Float:
-    if radius == 0.0:
-        return np.zeros((1, 2))
-    count = max(2, int(np.ceil(np.radians(end_deg - start_deg) / np.sqrt(16 * tolerance / radius))))
-    angle = np.radians(np.linspace(start_deg, end_deg, count + 1))
-    step = angle[1] - angle[0]
-    at = np.full(count + 1, radius * np.sqrt(step / np.sin(step)))  # equal area, as outline.flatten
-    at[[0, -1]] = radius
-    return np.column_stack([at * np.cos(angle), at * np.sin(angle)])
-
-
-def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Float:
-    """Foreshortened turns of the unit disc, shape (P, 2, 2); those without a turn come first."""
-
-    def turn(degrees: float) -> Float:
-        c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-        return np.array([[c, -s], [s, c]])
-
-    views = [np.eye(2)] if 0.0 in tilts_deg else []
-    for tilt in tilts_deg:
-        if tilt:
-            squeeze = np.diag([np.cos(np.radians(tilt)), 1.0])
-            views += [turn(d) @ squeeze @ turn(-d) for d in DIRECTIONS_DEG]
-    return np.array([view @ turn(360.0 * n / turns) for n in range(turns) for view in views])
-
-
-def images(polygons: Sequence[Float], poses: Float, half: int, blur_px: float = 0.0) -> Float32:
-    """Exact coverage of polygons in a square window about the origin.
-
-    Parameters
-    ----------
-    polygons : sequence of ndarray of shape (N, 2)
-    poses : ndarray of shape (P, 2, 3)
-        ``[A | shift]`` from the polygons' frame to px.
-    half : int
-        The window has ``2 * half + 1`` pixels a side, the origin in its middle.
-    blur_px : float
-        Standard deviation of a Gaussian.
-
-    Returns
-    -------
-    ndarray of shape (P, len(polygons), (2 * half + 1)**2), float32
-    """
-    from scipy.ndimage import gaussian_filter1d
-
-    side = 2 * half + 1
-    out = np.empty((len(poses), len(polygons), side * side), np.float32)
-    margin = half + (int(np.ceil(4 * blur_px)) + 1 if blur_px else 0)
-    for pose, image in zip(poses, out, strict=True):
-        placed = [p @ pose[:, :2].T + pose[:, 2] for p in polygons]
-        x, y, w, h = box_around(placed)
-        reach = max(-x, -y, x + w - 1, y + h - 1, margin)
-        covered = np.array(coverage([[p] for p in placed], [(-reach, -reach, 2 * reach + 1, 2 * reach + 1)] * len(placed)))
-        covered = covered[:, reach - margin : reach + margin + 1, reach - margin : reach + margin + 1]
-        if blur_px:
-            for axis in (1, 2):
-                covered = gaussian_filter1d(covered, blur_px, axis, mode="nearest")
-        cut = margin - half
-        image[:] = covered[:, cut : cut + side, cut : cut + side].reshape(len(polygons), -1)
-    return out
-
-
-def _poses(attitude: Float, shift_px: Sequence[float] = (0.0, 0.0)) -> Float:
-    return np.concatenate([attitude, np.broadcast_to(np.array(shift_px)[None, :, None], (len(attitude), 2, 1))], 2)
-
-
-def _seen(grid: Grid, attitude: Float, seen: float, shift_px: Sequence[float] = (0.0, 0.0)) -> Float32:
-    """Blurred cells, (P, cells, pixels), of patches so large that ``seen`` of their radius is SEEN_PX."""
-    farthest = np.hypot(HALF + 4 * BLUR * SEEN_PX, HALF + 4 * BLUR * SEEN_PX) + SHIFT * SEEN_PX + 2
-    reach = farthest * seen / SEEN_PX / np.linalg.svd(attitude, compute_uv=False).min()
-    cells = grid.cells(0.01 * seen / SEEN_PX, float(reach))
-    return images(cells, _poses(SEEN_PX / seen * attitude, shift_px), HALF, BLUR * SEEN_PX)
-
-
-def _windows(attitude: Float) -> Float32:
-    """Weights of the pixels of the seen disc under each attitude, (P, pixels), summing to 1."""
-    disc = _arc(1.0, 0.0, 360.0, 1e-3)[:-1]
-    weight = images([disc], _poses(SEEN_PX * attitude), HALF)[:, 0]
-    return np.asarray(weight / weight.sum(1, keepdims=True))
-
-
-def _moments(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
-    """Images of designs without their weighted mean, (n, pixels), and their standard deviations, (n,)."""
-    image = inks @ cells
-    image = image - (image @ weight)[:, None]
-    return image, np.sqrt(np.maximum((image * image) @ weight, 1e-9))
 
 
 # --- Localisation -------------------------------------------------------------------------------------
@@ -267,11 +113,16 @@ def bound(
             pose[row, column] += sign * step * move
             poses.append(pose)
     half = int(np.ceil(np.abs(np.concatenate(list(cells)) @ attitude.T).max() + 3 * blur_px)) + 2
-    parts = images(cells, np.array(poses), half, blur_px).astype(np.float64)
-    whole = parts.sum(1)
-    inside = np.all(whole > 1 - 1e-5, axis=0) if not rim else np.ones(whole.shape[1], bool)
-    parts, whole = parts[:, :, inside], whole[:, inside]
-    black = np.einsum("nc,kcp->nkp", inks, parts)
+    sums = np.vstack([inks, np.ones((1, len(cells)), np.float32)])
+    if len(sums) < len(cells):
+        parts = images(cells, np.array(poses), half, blur_px, sums)
+    else:
+        parts = sums @ images(cells, np.array(poses), half, blur_px)
+    whole = parts[:, -1]
+    if not rim:
+        parts = parts[:, :, np.all(whole > 1 - 1e-5, axis=0)]
+    parts = parts.astype(np.float64).transpose(1, 0, 2)
+    black, whole = parts[:-1], parts[-1]
     image = 0.5 * whole - black  # white is 1/2, black is -1/2, what surrounds them is 0
     geometric = (image[:, 1::2] - image[:, 2::2]) / (2 * step)
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
@@ -290,7 +141,8 @@ def disc_bound(
     """:func:`bound` of designs of a radius and tilt; the worst over the directions of the tilt."""
     cells = grid.cells(0.005 / radius_px)
     found = [
-        bound(cells, inks, radius_px * view, blur * radius_px, rim) for view in attitudes(turns=1, tilts_deg=(tilt_deg,))
+        bound(cells, inks, radius_px * view, blur * radius_px, rim)
+        for view in attitudes(turns=1, tilts_deg=(tilt_deg,))
     ]
     return np.max([worst for worst, _ in found], axis=0), np.max([rms for _, rms in found], axis=0)
 
@@ -307,15 +159,15 @@ def basin(grid: Grid, inks: Float32) -> Float:
     ndarray of shape (n,)
     """
     view = attitudes()
-    weight = _windows(np.eye(2)[None])[0]
+    weight = window_weights(np.eye(2)[None])[0]
     least = np.full(len(inks), np.inf)
     for seen in SEEN_BASIN:
-        still, spread = _moments(weight, _seen(grid, np.eye(2)[None], seen)[0], inks)
+        still, spread = moments(weight, seen_cells(grid, np.eye(2)[None], seen)[0], inks)
         for angle in 2 * np.pi * np.arange(8) / 8:
             shift = (SHIFT * SEEN_PX * np.cos(angle), SHIFT * SEEN_PX * np.sin(angle))
             best = np.zeros(len(inks), np.float32)
-            for cells in _seen(grid, view, seen, shift):
-                moved, moved_spread = _moments(weight, cells, inks)
+            for cells in seen_cells(grid, view, seen, shift):
+                moved, moved_spread = moments(weight, cells, inks)
                 best = np.maximum(best, np.einsum("np,np,p->n", still, moved, weight) / (spread * moved_spread))
             least = np.minimum(least, spread * np.sqrt(np.maximum(1 - best**2, 0)))
     return least
@@ -340,7 +192,9 @@ def tilt_bias(patch: Patch, radius_px: float = 45.0, tilt_deg: float = 60.0) -> 
 # --- Identity -----------------------------------------------------------------------------------------
 
 
-def correlation_and_distance(grid: Grid, inks: Float32, progress: Callable[[], None] = lambda: None) -> tuple[Float32, Float32]:
+def correlation_and_distance(
+    grid: Grid, inks: Float32, progress: Callable[[], None] = lambda: None
+) -> tuple[Float32, Float32]:
     """How alike designs can look, over all pairs of attitudes, of the mirror images too.
 
     The first design is seen, blurred, in every tilt of TILTS_DEG; the second may have any attitude, gain
@@ -350,7 +204,6 @@ def correlation_and_distance(grid: Grid, inks: Float32, progress: Callable[[], N
     Parameters
     ----------
     grid : Grid
-        Must map to itself under a mirror (angles symmetric about 0), else mirror images are left out.
     inks : ndarray of shape (n, cells)
 
     Returns
@@ -362,20 +215,20 @@ def correlation_and_distance(grid: Grid, inks: Float32, progress: Callable[[], N
     """
     view = attitudes()
     flat = attitudes(turns=1)
-    weights = _windows(flat)
-    both = np.concatenate([inks, mirrored(grid, inks)])
+    weights = window_weights(flat)
+    both = np.concatenate([inks, grid.mirrored(inks)])
     n = len(inks)
     correlation = np.zeros((n, n), np.float32)
     distance = np.full((n, n), np.inf, np.float32)
     for seen in SEEN_IDENTITY:
-        cells = _seen(grid, view, seen)
+        cells = seen_cells(grid, view, seen)
         for weight, own in zip(weights, cells[: len(flat)], strict=True):
             keep = weight > 0
-            first, spread = _moments(weight[keep], own[:, keep], inks)
+            first, spread = moments(weight[keep], own[:, keep], inks)
             first = first * weight[keep] / spread[:, None]
             best = np.zeros((n, 2 * n), np.float32)
             for other in cells[:, :, keep]:
-                second, other_spread = _moments(weight[keep], other, both)
+                second, other_spread = moments(weight[keep], other, both)
                 np.maximum(best, first @ (second / other_spread[:, None]).T, out=best)
             worse = np.minimum(np.maximum(best[:, :n], best[:, n:]), 1.0)
             np.maximum(correlation, worse, out=correlation)
@@ -384,24 +237,14 @@ def correlation_and_distance(grid: Grid, inks: Float32, progress: Callable[[], N
     return np.maximum(correlation, correlation.T), np.minimum(distance, distance.T)
 
 
-def mirrored(grid: Grid, inks: Float32) -> Float32:
-    """Inks of the mirror images, (n, cells); those given where the grid has no mirror symmetry."""
-    angles = np.array(grid.angles_deg)
-    if not np.allclose(np.sort(-angles % 360.0), angles):
-        return inks
-    middle = grid._middles()[1] % 360.0
-    order = [int(np.argmin(np.abs((middle + a + 180.0) % 360.0 - 180.0))) for a in middle]
-    return inks.reshape(len(inks), *grid.shape)[:, :, order].reshape(len(inks), -1)
-
-
 def turned_distance(grid: Grid, inks: Float32) -> Float:
     """Smallest distance of each design to itself, turned in the plane by 45 degrees or more, shape (n,)."""
-    weight = _windows(np.eye(2)[None])[0]
-    still, *turned = _seen(grid, attitudes(TURNS, (0.0,)), 1.0)
-    first, spread = _moments(weight, still, inks)
+    weight = window_weights(np.eye(2)[None])[0]
+    still, *turned = seen_cells(grid, attitudes(TURNS, (0.0,)), 1.0)
+    first, spread = moments(weight, still, inks)
     best = np.zeros(len(inks))
     for cells in turned[TURNS // 8 - 1 : TURNS - TURNS // 8]:
-        other, other_spread = _moments(weight, cells, inks)
+        other, other_spread = moments(weight, cells, inks)
         best = np.maximum(best, np.einsum("np,np,p->n", first, other, weight) / (spread * other_spread))
     return np.asarray(spread * np.sqrt(np.maximum(1 - best**2, 0)))
 
@@ -420,7 +263,7 @@ def symmetry_order(patch: Patch) -> int:
 # --- Nature -------------------------------------------------------------------------------------------
 
 
-def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count: int = WINDOWS) -> Float32:
+def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count: int = WINDOWS) -> UInt8:
     """Windows at random places of images at full, half and quarter size.
 
     Parameters
@@ -432,46 +275,50 @@ def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count
 
     Returns
     -------
-    ndarray of shape (count or fewer, pixels), float32, blurred as the designs are.
+    ndarray of shape (count or fewer, side, side), uint8
+        With room around the seen disc for a blur.
     """
     import cv2
 
-    side, found, total = 2 * HALF + 1, [], 0
+    side, found, total = 2 * (HALF + MARGIN) + 1, [], 0
     for photograph in photographs:
         scale = 2.0 ** -rng.integers(0, 3)
         size = [max(side, round(scale * n)) for n in photograph.shape[::-1]]
-        image = cv2.resize(photograph, size, interpolation=cv2.INTER_AREA).astype(np.float32)
-        image = cv2.GaussianBlur(image, (0, 0), BLUR * SEEN_PX)
-        view = np.lib.stride_tricks.sliding_window_view(image, (side, side))
+        view = np.lib.stride_tricks.sliding_window_view(
+            cv2.resize(photograph, size, interpolation=cv2.INTER_AREA), (side, side)
+        )
         rows, columns = rng.integers(0, view.shape[:2], (200, 2)).T
-        found.append(view[rows, columns].reshape(200, -1))
+        found.append(view[rows, columns])
         total += 200
         if total >= count:
             break
     return np.concatenate(found)[:count]
 
 
-def natural_response(grid: Grid, inks: Float32, windows: Float32) -> Float:
+def natural_response(grid: Grid, inks: Float32, windows: UInt8, blur: float = 0.0) -> Float:
     """Share of places in images that look like a design in some attitude.
 
     Parameters
     ----------
-    windows : ndarray of shape (N, pixels)
+    windows : ndarray of shape (N, side, side), uint8
         From :func:`sample_windows`. Those with a standard deviation under 8 grey levels count as unlike.
+    blur : float
+        Of designs and windows alike.
 
     Returns
     -------
     ndarray of shape (n, 2)
         Share of the windows whose correlation exceeds each of LOOKS_ALIKE.
     """
-    weight = _windows(np.eye(2)[None])[0]
-    windows = windows - (windows @ weight)[:, None]
-    spread = np.sqrt((windows * windows) @ weight)
+    weight = window_weights(np.eye(2)[None])[0]
+    seen = blurred(windows.astype(np.float32), blur * SEEN_PX, HALF).reshape(len(windows), -1)
+    seen = seen - (seen @ weight)[:, None]
+    spread = np.sqrt((seen * seen) @ weight)
     textured = spread >= 8
-    nature = (windows[textured] * weight / spread[textured, None]).T.astype(np.float32)
+    nature = (seen[textured] * weight / spread[textured, None]).T
     best = np.zeros((len(inks), nature.shape[1]), np.float32)
-    for cells in _seen(grid, attitudes(), 1.0):
-        image, own_spread = _moments(weight, cells, inks)
+    for cells in seen_cells(grid, attitudes(), 1.0, blur=blur):
+        image, own_spread = moments(weight, cells, inks)
         np.maximum(best, (image / own_spread[:, None]) @ nature, out=best)
     return np.array([(best > limit).sum(1) / len(windows) for limit in LOOKS_ALIKE]).T
 
@@ -520,6 +367,7 @@ class DesignReport:
     bound_without_rim_px: float
     basin: float
     natural_response: tuple[float, ...]
+    natural_response_blurred: tuple[float, ...]
 
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
         """One of :attr:`bounds`."""
@@ -571,13 +419,13 @@ def _without_infinity(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def analyse(patches: Sequence[Patch], windows: Float32, progress: Callable[[], None] = lambda: None) -> Analysis:
+def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], None] = lambda: None) -> Analysis:
     """Measure designs.
 
     Parameters
     ----------
     patches : sequence of Patch
-    windows : ndarray of shape (N, pixels)
+    windows : ndarray of shape (N, side, side), uint8
         From :func:`sample_windows`.
     progress : callable
         Called now and then, :data:`STEPS` times in all.
@@ -603,6 +451,7 @@ def analyse(patches: Sequence[Patch], windows: Float32, progress: Callable[[], N
         without_rim,
         basin(grid, inks),
         natural_response(grid, inks, windows),
+        natural_response(grid, inks, windows, BLUR),
         strict=True,
     )
     reports = tuple(
@@ -618,9 +467,10 @@ def analyse(patches: Sequence[Patch], windows: Float32, progress: Callable[[], N
             tuple(found),
             float(hidden),
             float(bound_to_centre),
-            tuple(float(share) for share in natural),
+            tuple(sharp.tolist()),
+            tuple(blurred.tolist()),
         )
-        for p, turned, black, pixels, found, hidden, bound_to_centre, natural in measures
+        for p, turned, black, pixels, found, hidden, bound_to_centre, sharp, blurred in measures
     )
     return Analysis(reports, correlation, distance)
 

@@ -2,22 +2,51 @@
 
 Images are (H, W) or (H, W, 3), grey or RGB. No effect moves the image: every kernel's centroid is its
 centre. Borders are mirrored, so that no edge appears there. Levels are grey levels (0-255) and px.
+
+An effect is recorded as a dict, its name under "effect" and the arguments of its function beside it:
+:data:`LADDER` draws one for a level, :func:`apply` carries it out.
 """
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
+from kpbench.errors import DataError
 from kpbench.keypoints import Float, UInt8
-from kpbench.raster import coverage
+from kpbench.raster import Box, box_around, coverage
 
-__all__ = ["LADDER", "blur", "brightness", "dimming", "motion_blur", "noise", "paper_mix", "rain", "shadow"]
+__all__ = [
+    "LADDER",
+    "Rungs",
+    "apply",
+    "blur",
+    "brightness",
+    "climb",
+    "defocus",
+    "dimming",
+    "flare",
+    "gaussian_blur",
+    "jpeg",
+    "low_light",
+    "motion_blur",
+    "noise",
+    "occlusion",
+    "occlusion_cover",
+    "paper_mix",
+    "rain",
+    "rainfall",
+    "shadow",
+    "shadow_edge",
+]
+
+Effect = dict[str, Any]
 
 BORDER = cv2.BORDER_REFLECT_101
 
@@ -111,12 +140,287 @@ def rain(image: UInt8, seed: int) -> UInt8:
     return np.ascontiguousarray(transform(image=cv2.merge([image] * 3))["image"][..., 0])
 
 
-LADDER: dict[str, tuple[Callable[[UInt8, np.random.Generator, float], UInt8], tuple[float, ...]]] = {
-    "blur": (lambda image, rng, level: blur(image, level), (3, 7, 11, 15)),
-    "dimming": (lambda image, rng, level: dimming(image, level), (10, 20, 30, 40)),
-    "noise": (lambda image, rng, level: noise(image, rng, level), (15, 30, 45, 60)),
+@lru_cache(maxsize=64)
+def disc_kernel(radius_px: float) -> Float:
+    """Exact area coverage of a disc about the kernel's centre: an ideal lens out of focus."""
+    angles = np.arange(256) * (2 * np.pi / 256)
+    step = 2 * np.pi / 256
+    rim = (
+        radius_px * np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles)])
+    )  # the disc's area
+    reach = int(np.ceil(radius_px)) + 1
+    kernel = coverage([[rim]], [(-reach, -reach, 2 * reach + 1, 2 * reach + 1)])[0]
+    kernel = kernel + kernel[::-1, ::-1]
+    return np.asarray(kernel / kernel.sum())
+
+
+def defocus(image: UInt8, radius_px: float) -> UInt8:
+    """Mean over the disc of confusion: each point spreads to a disc of this radius."""
+    return np.asarray(cv2.filter2D(image, -1, disc_kernel(radius_px), borderType=BORDER), np.uint8)
+
+
+def gaussian_taps(sigma_px: float) -> Float:
+    """Weights of a Gaussian out to four standard deviations, centred on the middle tap."""
+    reach = int(np.ceil(4 * sigma_px))
+    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
+    return np.asarray(taps / taps.sum())
+
+
+def gaussian_blur(image: UInt8, sigma_px: float) -> UInt8:
+    """Gaussian of standard deviation ``sigma_px``."""
+    taps = gaussian_taps(sigma_px)
+    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=BORDER), np.uint8)
+
+
+def _grid(image: UInt8, x: float, y: float) -> tuple[Any, Any]:
+    """Offsets of all pixels from a point: a row (1, W) and a column (H, 1), float32."""
+    rows, columns = image.shape[:2]
+    return (np.arange(columns, dtype=np.float32) - np.float32(x))[None], (
+        np.arange(rows, dtype=np.float32) - np.float32(y)
+    )[:, None]
+
+
+def _across(field: Any, image: UInt8) -> Any:
+    """A field of shape (H, W), ready to be combined with the image, grey or RGB."""
+    return field if image.ndim == 2 else field[..., None]
+
+
+def shadow_edge(image: UInt8, x: float, y: float, angle_deg: float, light: float, penumbra_px: float) -> UInt8:
+    """Shade the side towards ``angle_deg`` of a straight edge through (x, y) to a fraction of its light.
+
+    Light falls linearly across the penumbra, as behind a straight edge under a lamp of uniform width.
+    """
+    dx, dy = _grid(image, x, y)
+    c, s = (np.float32(v) for v in (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))))
+    shaded = np.clip((dx * c + dy * s) / np.float32(penumbra_px) + np.float32(0.5), 0, 1)
+    return _uint8(image * _across(1 - np.float32(1 - light) * shaded, image))
+
+
+def rainfall(image: UInt8, seed: int, streaks: int, length_px: float, slant_deg: float) -> UInt8:
+    """Bright streaks of falling drops, each at its own place, length and opacity; the scene itself stays.
+
+    :func:`rain` is the fixed mixture of the library that the paper used; this one has a strength.
+    """
+    rng = np.random.default_rng(seed)
+    rows, columns = image.shape[:2]
+    layer = np.zeros((rows, columns), np.uint8)
+    start = rng.uniform(-0.05, 1.05, (streaks, 2)) * (columns, rows)
+    slant = np.radians(slant_deg + rng.normal(0, 2, streaks))
+    step = (length_px * rng.uniform(0.5, 1.5, streaks))[:, None] * np.column_stack([np.sin(slant), np.cos(slant)])
+    opacity, thick = rng.integers(60, 200, streaks), rng.random(streaks) < 0.25
+    ends = np.rint(16 * np.stack([start, start + step], axis=1)).astype(int).tolist()
+    for (a, b), level, wide in zip(ends, opacity.tolist(), thick.tolist(), strict=True):
+        cv2.line(layer, a, b, level, 2 if wide else 1, cv2.LINE_AA, 4)
+    share = _across(cv2.blur(layer, (3, 3)).astype(np.float32) / 255, image)
+    return _uint8(image + (np.float32(225) - image) * share)
+
+
+def jpeg(image: UInt8, quality: int) -> UInt8:
+    """Compress and decompress as baseline JPEG of a quality from 1 to 100."""
+    swapped = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image  # OpenCV's order is BGR
+    packed = cv2.imencode(".jpg", swapped, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])[1]
+    back = np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED), np.uint8)
+    return np.ascontiguousarray(back[..., ::-1]) if image.ndim == 3 else back
+
+
+def low_light(
+    image: UInt8,
+    rng: np.random.Generator,
+    stops: float,
+    full_well_e: float = 10_000.0,
+    read_noise_e: float = 3.0,
+    most_gain: float = 16.0,
+    bits: int = 10,
+) -> UInt8:
+    """The same picture taken with ``2 ** -stops`` of the light, brightened to what it was.
+
+    Grey level 255 is a full well at full light. Electrons arrive by Poisson's law, reading adds Gaussian noise,
+    the analogue gain makes up for up to ``most_gain``, the converter rounds to ``bits``, and what
+    is still missing is multiplied in afterwards (EMVA Standard 1288, the linear camera model).
+    """
+    light = 2.0**-stops
+    electrons = rng.poisson(image * (full_well_e * light / 255)).astype(np.float32)
+    electrons += np.float32(read_noise_e) * rng.standard_normal(image.shape, dtype=np.float32)
+    gain, steps = min(most_gain, 1 / light), 2**bits - 1
+    numbers = np.clip(np.rint(electrons * np.float32(gain * steps / full_well_e)), 0, steps)
+    return _uint8(numbers * np.float32(255 / (steps * gain * light)))
+
+
+def _strips(strips: list[list[float]]) -> list[Float]:
+    """Corners of rectangles from (x, y of the middle, length, width, angle)."""
+    corners = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
+    turned = []
+    for x, y, length, width, angle_deg, _ in strips:
+        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        turned.append(corners * (length, width) @ np.array([[c, s], [-s, c]]) + (x, y))
+    return turned
+
+
+def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
+    """Lay opaque strips over the image: [x, y (of the middle), length, width in px, angle_deg, grey] each."""
+    result = image.copy()
+    for polygon, strip in zip(_strips(strips), strips, strict=True):
+        x, y, w, h = box_around([polygon])
+        x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
+        if x1 <= x0 or y1 <= y0:
+            continue
+        cover = _across(coverage([[polygon]], [(x, y, w, h)])[0][y0 - y : y1 - y, x0 - x : x1 - x], image)
+        part = result[y0:y1, x0:x1]
+        result[y0:y1, x0:x1] = _uint8(part + (strip[5] - part) * cover)
+    return result
+
+
+def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
+    """Fraction of each pixel of a box that :func:`occlusion` hides, shape (height, width)."""
+    x, y, w, h = box
+    seen = np.ones((h, w))
+    for polygon in _strips(strips):
+        around = box_around([polygon])
+        x0, y0 = min(x, around[0]), min(y, around[1])
+        x1, y1 = max(x + w, around[0] + around[2]), max(y + h, around[1] + around[3])
+        cover = coverage([[polygon]], [(x0, y0, x1 - x0, y1 - y0)])[0]
+        seen *= 1 - cover[y - y0 : y - y0 + h, x - x0 : x - x0 + w]
+    return 1 - seen
+
+
+def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) -> UInt8:
+    """A lamp at (x, y) in the lens: a glow of ``strength`` grey levels that falls off with the distance, and ghosts.
+
+    The glow is ``strength * exp(-distance / reach_px)``; three faint discs lie mirrored across the image's centre.
+    """
+    dx, dy = _grid(image, x, y)
+    glow = np.exp(-np.sqrt(dx * dx + dy * dy) / np.float32(reach_px)) * np.float32(strength)
+    middle = (image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2
+    for along, size, share in ((-0.4, 0.25, 0.10), (-0.8, 0.45, 0.06), (0.5, 0.15, 0.12)):
+        dx, dy = _grid(image, middle[0] + along * (x - middle[0]), middle[1] + along * (y - middle[1]))
+        radius = np.float32(size * reach_px)
+        glow += np.float32(share * strength) * np.clip((radius - np.sqrt(dx * dx + dy * dy)) / 4 + 0.5, 0, 1)
+    return _uint8(image + _across(glow, image))
+
+
+# --- the ladder ---------------------------------------------------------------------------------------------------
+
+Discs = Float
+"""Patches in an image that an effect may aim at, shape (n, 3): x, y and radius in px."""
+
+
+Draw = Callable[[np.random.Generator, float, tuple[int, int], Discs], Effect]
+
+
+@dataclass(frozen=True)
+class Rungs:
+    """One effect of the ladder: its levels from mild to severe, their unit, and the least and most it takes.
+
+    ``draw(rng, level, (width_px, height_px), discs)`` gives the effect as a dict; what is not set by the
+    level (an angle, a place) is drawn.
+    """
+
+    levels: tuple[float, ...]
+    unit: str
+    bounds: tuple[float, float]
+    draw: Draw
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
+
+
+def _angle(rng: np.random.Generator, end: float) -> float:
+    return round(float(rng.uniform(0, end)), 1)
+
+
+def _draw_motion_blur(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    return {"effect": "motion_blur", "length_px": level, "angle_deg": _angle(rng, 180)}
+
+
+def _draw_shadow_edge(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    """Across one of the patches, off its centre by up to half its radius."""
+    x, y, radius = discs[int(rng.integers(len(discs)))]
+    x, y = (x, y) + radius * rng.uniform(-0.5, 0.5, 2)
+    where = {"x": round(float(x), 2), "y": round(float(y), 2), "angle_deg": _angle(rng, 360)}
+    return {"effect": "shadow_edge", **where, "light": round(1 - level / 100, 6), "penumbra_px": round(radius / 8, 2)}
+
+
+def _draw_occlusion(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    """A strip from a random side over every patch, so that ``level`` percent of its circle is hidden."""
+    reach = np.linspace(1, -1, 2001)
+    hidden = (np.arccos(reach) - reach * np.sqrt(1 - reach**2)) / np.pi  # share of a unit disc beyond x = reach
+    start = float(np.interp(level / 100, hidden, reach))
+    strips = []
+    for x, y, radius in discs:
+        angle_deg, grey = _angle(rng, 360), float(rng.integers(20, 236))
+        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        length, middle = (1.3 - start) * radius, (1.3 + start) / 2 * radius
+        strip = (x + c * middle, y + s * middle, length, 2.6 * radius)
+        strips.append([*(round(float(v), 3) for v in strip), angle_deg, grey])
+    return {"effect": "occlusion", "strips": strips}
+
+
+def _draw_flare(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    """The lamp stands one to four radii beside one of the patches."""
+    x, y, radius = discs[int(rng.integers(len(discs)))]
+    angle, away = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
+    where = {"x": round(float(x + away * np.cos(angle)), 2), "y": round(float(y + away * np.sin(angle)), 2)}
+    return {"effect": "flare", **where, "strength": level, "reach_px": round(0.15 * size[0], 2)}
+
+
+def _draw_rainfall(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    fixed = {"streaks": round(level * size[0] * size[1] / 1e6), "length_px": round(0.04 * size[0], 2)}
+    return {"effect": "rainfall", "seed": _seed(rng), **fixed, "slant_deg": round(float(rng.uniform(-20, 20)), 1)}
+
+
+def _set(effect: str, parameter: str, **fixed: Any) -> Draw:
+    """An effect that a level sets wholly."""
+    return lambda rng, level, size, discs: {"effect": effect, parameter: level, **fixed}
+
+
+LADDER: dict[str, Rungs] = {
+    "blur": Rungs((3, 7, 11, 15), "px", (1, 501), _set("blur", "kernel_px")),
+    "dimming": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k")),
+    "dimming-literal": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k", law="literal")),
+    "noise": Rungs((15, 30, 45, 60), "grey levels", (0, 1000), _set("noise", "sigma")),
+    "gaussian-blur": Rungs((1, 2, 3, 4.5), "px", (0.1, 100), _set("gaussian_blur", "sigma_px")),
+    "motion-blur": Rungs((5, 10, 20, 30), "px", (0.1, 500), _draw_motion_blur),
+    "defocus": Rungs((2, 4, 6, 9), "px", (0.1, 250), _set("defocus", "radius_px")),
+    "shadow-edge": Rungs((30, 50, 70, 90), "% of the light", (0, 100), _draw_shadow_edge),
+    "rain": Rungs((500, 1000, 2000, 4000), "streaks a megapixel", (0, 1e5), _draw_rainfall),
+    "jpeg": Rungs((50, 25, 10, 5), "quality", (1, 100), _set("jpeg", "quality")),
+    "low-light": Rungs((4, 6, 8, 9), "stops", (0, 14), _set("low_light", "stops")),
+    "occlusion": Rungs((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
+    "flare": Rungs((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),
 }
-"""Effect → (function of image, rng and level; the rungs of the paper's tables)."""
+"""Effect → its rungs. Stacks are effects applied one after the other."""
+
+
+def climb(
+    rng: np.random.Generator, effect: str, level: float, size_px: tuple[int, int], discs: Discs | None = None
+) -> Effect:
+    """Draw what a level leaves open; the result goes into :func:`apply`.
+
+    Parameters
+    ----------
+    rng
+    effect : a key of :data:`LADDER`.
+    level : any number in the effect's unit, not only one of its rungs.
+    size_px : (width, height) of the image.
+    discs : ndarray of shape (n, 3), optional
+        x, y and radius of the patches that shadow edge, occlusion and flare aim at; one random place if left out.
+
+    Raises
+    ------
+    DataError
+        If there is no such effect, or the level makes no sense for it.
+    """
+    if effect not in LADDER:
+        raise DataError(f"there is no effect {effect!r}, only: {', '.join(LADDER)}")
+    rungs = LADDER[effect]
+    low, high = rungs.bounds
+    if not low <= level <= high:
+        raise DataError(f"{effect} takes a level from {low:g} to {high:g} ({rungs.unit}), not {level:g}")
+    if discs is None or not len(discs):
+        width, height = size_px
+        discs = np.array([[rng.uniform(0.2, 0.8) * width, rng.uniform(0.2, 0.8) * height, 0.05 * width]])
+    return rungs.draw(rng, level, size_px, discs)
 
 
 def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[str, Any]]]:
@@ -152,14 +456,23 @@ FUNCTIONS: dict[str, Callable[..., UInt8]] = {
     "brightness": brightness,
     "dimming": dimming,
     "noise": noise,
+    "gaussian_blur": gaussian_blur,
+    "defocus": defocus,
+    "shadow_edge": shadow_edge,
+    "rainfall": rainfall,
+    "jpeg": jpeg,
+    "low_light": low_light,
+    "occlusion": occlusion,
+    "flare": flare,
 }
+DRAWS_A_FIELD = ("noise", "low_light")
 
 
-def apply(image: UInt8, rng: np.random.Generator, effects: list[dict[str, Any]]) -> UInt8:
-    """Apply recorded effects in order; noise takes its field from ``rng``."""
+def apply(image: UInt8, rng: np.random.Generator, effects: list[Effect]) -> UInt8:
+    """Apply recorded effects in order; noise and low light take their fields from ``rng``."""
     for entry in effects:
         parameters = {key: value for key, value in entry.items() if key != "effect"}
-        if entry["effect"] == "noise":
+        if entry["effect"] in DRAWS_A_FIELD:
             parameters["rng"] = rng
         image = FUNCTIONS[entry["effect"]](image, **parameters)
     return image

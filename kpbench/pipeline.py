@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cache, cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -30,12 +30,35 @@ from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
 from kpbench.scene import Limits, Rendered, measure_contrast, random_placements, render_scene
 
-__all__ = ["Progress", "SynthConfig", "generate", "make_sample"]
+__all__ = ["Progress", "Recipe", "SynthConfig", "generate", "make_sample"]
 
 Progress = Callable[[int], None]
 """Called with the number of images that are finished since the last call."""
 
 BACKGROUND, SCENE, DETERIORATION = range(3)
+
+
+class Recipe(Protocol):
+    """A dataset's definition: picklable, hashable, and all that its images are a function of.
+
+    ``n`` images in shards of ``shard_size``; ``image_bytes`` is what one is expected to take on disk.
+    """
+
+    @property
+    def n(self) -> int: ...
+    @property
+    def shard_size(self) -> int: ...
+    @property
+    def image_bytes(self) -> int: ...
+    def to_dict(self) -> dict[str, Any]:
+        """The config that is written into the dataset: no path of this machine."""
+        ...
+
+    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
+        """One image, and the broken background files met on the way."""
+        ...
+
+    def __hash__(self) -> int: ...
 
 
 @dataclass(frozen=True)
@@ -107,6 +130,16 @@ class SynthConfig:
             "patches": [patch.to_dict() for patch in self.patches],
         }
 
+    @property
+    def image_bytes(self) -> int:
+        """Expected size on disk: photographs deflate to about two thirds, noise hardly at all."""
+        width, height = self.size_px
+        return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
+
+    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
+        """See :func:`make_sample`."""
+        return make_sample(self, index)
+
     def __getstate__(self) -> dict[str, Any]:
         return {key: value for key, value in self.__dict__.items() if key != "photos"}
 
@@ -154,7 +187,7 @@ class Run:
 
 
 def generate(
-    config: SynthConfig,
+    config: Recipe,
     out: str | Path,
     *,
     workers: int | None = None,
@@ -162,11 +195,12 @@ def generate(
     overwrite: bool = False,
     progress: Progress = lambda images: None,
 ) -> Run:
-    """Write a synthetic set into a folder.
+    """Write a dataset into a folder.
 
     Parameters
     ----------
-    config : SynthConfig
+    config : Recipe
+        :class:`SynthConfig` or :class:`kpbench.suite.SuiteConfig`.
     out : folder; made if it is not there.
     workers : processes; None for one a core. 1 works in this process.
     resume : keep the finished shards of an interrupted run and make the rest.
@@ -189,14 +223,14 @@ def generate(
         plan = _plan(config)
         done = _prepare(folder, config, written, plan, resume, overwrite)
         todo = [piece for piece in plan if piece[0] not in done]
-        _check_space(folder, config, sum(count for _, _, count in todo))
+        _check_space(folder, config.image_bytes, sum(count for _, _, count in todo))
         progress(sum(done[name][0].count for name in done))
         results = dict(done)
         for entry, broken in _run(config, written, folder, todo, workers, progress):
             results[entry.file] = (entry, broken)
         entries = [results[name][0] for name, _, _ in plan]
         broken = tuple(sorted({file for _, files in results.values() for file in files}))
-        store.write_manifest(folder, written, entries, _provenance(config, broken))
+        store.write_manifest(folder, written, entries, _provenance(broken))
     return Run(store.open_dataset(folder), broken, sum(entry.count for entry, _ in done.values()))
 
 
@@ -204,14 +238,14 @@ Piece = tuple[str, int, int]
 Result = tuple[store.ShardEntry, tuple[str, ...]]
 
 
-def _plan(config: SynthConfig) -> list[Piece]:
+def _plan(config: Recipe) -> list[Piece]:
     """(file, first image, number of images) of every shard."""
     firsts = range(0, config.n, config.shard_size)
     return [(f"shard-{k:05d}.h5", first, min(config.shard_size, config.n - first)) for k, first in enumerate(firsts)]
 
 
 def _prepare(
-    folder: Path, config: SynthConfig, written: dict[str, Any], plan: list[Piece], resume: bool, overwrite: bool
+    folder: Path, config: Recipe, written: dict[str, Any], plan: list[Piece], resume: bool, overwrite: bool
 ) -> dict[str, Result]:
     """Look at what the folder holds; return the finished shards that this run can keep."""
     manifest = folder / store.MANIFEST
@@ -238,10 +272,9 @@ def _prepare(
     return kept
 
 
-def _check_space(folder: Path, config: SynthConfig, images: int) -> None:
-    """Refuse to start what cannot end: photographs deflate to about two thirds, noise hardly at all."""
-    width, height = config.size_px
-    need = int(images * width * height * config.channels * (0.85 if config.deteriorate == "paper" else 0.7))
+def _check_space(folder: Path, image_bytes: int, images: int) -> None:
+    """Refuse to start what cannot end."""
+    need = images * image_bytes
     free = shutil.disk_usage(folder).free
     if need > free:
         raise DataError(
@@ -273,7 +306,7 @@ def _locked(folder: Path) -> Iterator[None]:
             path.unlink(missing_ok=True)
 
 
-def _provenance(config: SynthConfig, broken: tuple[str, ...]) -> dict[str, Any]:
+def _provenance(broken: tuple[str, ...]) -> dict[str, Any]:
     """Versions that can change pixels, and the broken files; nothing that differs between equal runs."""
     libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "isal")
     return {
@@ -282,13 +315,11 @@ def _provenance(config: SynthConfig, broken: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
-def _write_shard(
-    config: SynthConfig, written: dict[str, Any], folder: Path, piece: Piece, progress: Progress
-) -> Result:
+def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: Piece, progress: Progress) -> Result:
     name, first, count = piece
     samples, met = [], set[str]()
     for index in range(first, first + count):
-        sample, failed = make_sample(config, index)
+        sample, failed = config.make(index)
         samples.append(sample)
         met.update(failed)
         progress(1)
@@ -299,7 +330,7 @@ def _write_shard(
 
 
 def _run(
-    config: SynthConfig,
+    config: Recipe,
     written: dict[str, Any],
     folder: Path,
     todo: list[Piece],
@@ -329,7 +360,7 @@ def _run(
 
 def _collect(
     pool: Executor,
-    config: SynthConfig,
+    config: Recipe,
     written: dict[str, Any],
     folder: Path,
     todo: list[Piece],
@@ -364,12 +395,12 @@ def _count(images: int) -> None:
         _counter.value += images
 
 
-def _work(config: SynthConfig, written: dict[str, Any], folder: Path, piece: Piece) -> Result:
+def _work(config: Recipe, written: dict[str, Any], folder: Path, piece: Piece) -> Result:
     return _write_shard(_of_this_process(config), written, folder, piece, _count)
 
 
 @cache
-def _of_this_process(config: SynthConfig) -> SynthConfig:
+def _of_this_process(config: Recipe) -> Recipe:
     """One config object a process, so that the decoded photographs are cached across shards."""
     return config
 

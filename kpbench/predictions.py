@@ -137,7 +137,8 @@ def _check(p: Predictions) -> None:
     if len(p.offsets) != n + 1 or p.offsets[0] != 0 or p.offsets[-1] != k or np.any(np.diff(p.offsets) < 0):
         raise PredictionsError(f"offsets do not run from 0 to {k} keypoints in {n} images")
     if len(p.score) != k or (p.patch_id is not None and len(p.patch_id) != k):
-        raise PredictionsError(f"{k} keypoints, but as many scores and ids are needed")
+        ids = k if p.patch_id is None else len(p.patch_id)
+        raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {ids} ids do not belong together")
 
     def complain(row: int, name: str, value: object, expected: str) -> NoReturn:
         image = int(np.searchsorted(p.offsets, row, side="right")) - 1
@@ -179,8 +180,9 @@ def read_predictions(path: str | Path) -> Predictions:
         if path.suffix.lower() not in READERS:
             *some, last = READERS
             raise PredictionsError(f"unknown kind of predictions file, expected {', '.join(some)} or {last}")
-        if path.is_file() and not path.stat().st_size:
-            raise PredictionsError("the file is empty")
+        with path.open("rb") as file:  # here, so that all formats say the same of a file that is not there
+            if not file.read(1):
+                raise PredictionsError("the file is empty")
         with _no_gc():
             return READERS[path.suffix.lower()](path)
     except PredictionsError as error:
@@ -401,8 +403,11 @@ def _first_bad_row(
                 return PredictionsError(f"{place(row)} has {len(cells)} values, expected {len(names)}")
             for name, cell in zip(names, cells, strict=True):
                 try:
-                    int(cell) if name == "image_id" else float(cell or 0)
+                    value = int(cell) if name == "image_id" else float(cell or 0)
+                    fine = abs(value) < 2**63 if name == "image_id" else math.isfinite(value)
                 except ValueError:
+                    fine = False
+                if not fine:
                     expected = "a whole number" if name in ("image_id", "id") else "a finite number"
                     return PredictionsError(f"{place(row)}: {name} is {_short(cell)}, expected {expected}")
     return PredictionsError(f"no table ({' '.join(str(error).split())[:120]})")
@@ -478,7 +483,9 @@ def _read_h5(path: Path) -> Predictions:
     columns: dict[str, NDArray[Any]] = {}
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
-            header = _header(_parse(str(file.attrs.get("header", "{}")).encode(), "the attribute header"))
+            header = {}
+            if "header" in file.attrs:
+                header = _header(_parse(str(file.attrs["header"]).encode(), "the attribute header"))
             for name in sorted(set(file) - H5_COLUMNS.keys()):
                 raise PredictionsError(f"unknown dataset /{name}, expected {', '.join(H5_COLUMNS)}")
             for name, kind in H5_COLUMNS.items():
@@ -496,8 +503,6 @@ def _read_h5(path: Path) -> Predictions:
                     raise PredictionsError(f"/{name} is {data.dtype} of shape {data.shape}, expected {kind}8 columns")
                 columns[name] = data[:]
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
         raise PredictionsError(f"damaged or no HDF5 file ({' '.join(str(error).split())[:120]})") from None
     if columns["xy"].shape[1:] != (2,):
         raise PredictionsError(f"/xy has shape {columns['xy'].shape}, expected (K, 2)")

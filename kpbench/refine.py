@@ -37,7 +37,7 @@ ANGLES = 24
 RINGS = (0.4, 0.7, 1.0)
 SOFT = 0.2
 """Blur of the templates, in ring radii: what remains of a ring of 3.5 px after the pyramid's smoothing."""
-RING_PX = 3.5
+RING_PX = 3.0
 """Short semi-axis of the outermost ring in px of its pyramid level; the smallest patch measures 5 px."""
 _turn = np.arange(ANGLES) * (2 * np.pi / ANGLES)
 RING_POINTS = np.concatenate([r * np.column_stack([np.cos(_turn), np.sin(_turn)]) for r in RINGS])
@@ -262,7 +262,9 @@ def align(levels: Sequence[Float32], poses: Poses, known: Bank, steps: int, ring
         residual = values / np.maximum(ncc, 0.3)[:, None] - ink
         delta = np.einsum("nkm,nm->nk", solve, residual).astype(np.float64)
         delta *= np.minimum(1.0, 0.35 / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
-        A = A @ np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
+        turn = np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
+        # sectors have no size: what is left of it in the templates is their blur, which is no guide
+        A = A @ turn / np.sqrt(np.abs(np.linalg.det(turn)))[:, None, None]
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])
     return Poses(xy, A, which, ncc.astype(np.float64))
 

@@ -10,11 +10,15 @@ they are neither to be found nor to be left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -27,11 +31,12 @@ from kpbench.keypoints import Float, UInt8
 from kpbench.raster import Box, box_around, coverage
 from kpbench.scene import Limits, random_placements, render_scene
 
-__all__ = ["Batch", "SampleConfig", "load_photos", "make_batch"]
+__all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]
 
 Float32 = NDArray[np.float32]
 
 MOST_KEYPOINTS = 12
+VALIDATION_EVERY = 10
 IMAGE_WIDTH_PX = 640  # the image that a crop is thought to be cut from: focal lengths are relative to it
 DETECTABLE = 12.0
 """Least contrast / noise · √area of a keypoint that is asked for: 6 σ at the output of a matched filter."""
@@ -67,26 +72,31 @@ class Batch(NamedTuple):
     keypoints: Float32
 
 
-def load_photos(folder: str | Path | None, keep: slice = slice(None)) -> list[UInt8]:
-    """All photographs of a folder in grey, in the order of their names; broken ones are left out.
+def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
+    """Photographs of a folder in grey, in the order of their names; broken ones are left out.
 
     Parameters
     ----------
     folder : path or None
         None gives 64 procedural textures.
-    keep : slice
-        Which of the files to take.
+    part : str
+        "validation" (every tenth) or "training" (the others); one photograph alone is both.
 
     Raises
     ------
     DataError
         As :meth:`kpbench.background.PhotoFolder.open`.
     """
+
+    def kept(n: int, count: int) -> bool:
+        return count == 1 or (n % VALIDATION_EVERY == 0) == (part == "validation")
+
     if folder is None:
-        return [procedural(np.random.default_rng([2410, n]), 640, 480) for n in range(64)]
+        return [procedural(np.random.default_rng([2410, n]), 640, 480) for n in range(64) if kept(n, 64)]
     photos = PhotoFolder.open(folder)
-    read = (cv2.imread(str(photos.path / name), cv2.IMREAD_GRAYSCALE) for name in photos.files[keep])
-    return [_at_most(image) for image in read if image is not None]
+    files = [name for n, name in enumerate(photos.files) if kept(n, len(photos.files))]
+    read = (cv2.imread(str(photos.path / name), cv2.IMREAD_GRAYSCALE) for name in files)
+    return [_at_most(np.asarray(image, np.uint8)) for image in read if image is not None]
 
 
 def _at_most(image: NDArray[np.uint8], side: int = 640) -> UInt8:
@@ -121,6 +131,64 @@ def make_batch(
     if config.kind == "scenes":
         return _scenes(config, patches, photos, rng, seed, index * count, count, severity)
     return _crops(config, patches, photos, rng, count, severity)
+
+
+@dataclass(frozen=True)
+class Job:
+    """One batch to make: its index, its number of samples, and the severity of its degradations."""
+
+    index: int
+    count: int
+    severity: float
+
+
+def stream(
+    config: SampleConfig,
+    patches: Sequence[Patch],
+    folder: str | Path | None,
+    seed: int,
+    jobs: Iterable[Job],
+    workers: int,
+) -> Iterator[Batch]:
+    """Training batches in the order of their jobs, made ahead by worker processes (0: by this one).
+
+    The processes are started afresh, not forked: they load neither torch nor its threads.
+    """
+    if workers == 0:
+        _start_worker(config, patches, folder, seed)
+        yield from map(_work, jobs)
+        return
+    spawn = multiprocessing.get_context("spawn")
+    arguments = (config, tuple(patches), folder, seed)
+    pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(*arguments, True))
+    ahead: deque[Future[Batch]] = deque()
+    try:
+        for job in jobs:
+            ahead.append(pool.submit(_work, job))
+            if len(ahead) > 4 * workers:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+_worker: dict[str, Any] = {}
+
+
+def _start_worker(
+    config: SampleConfig, patches: Sequence[Patch], folder: str | Path | None, seed: int, own: bool = False
+) -> None:
+    if own:  # the main process decides when to stop, and takes its workers with it
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        cv2.setNumThreads(1)
+    photos = load_photos(folder, "training")
+    _worker.update(config=config, patches=patches, photos=photos, seed=seed)
+
+
+def _work(job: Job) -> Batch:
+    return make_batch(**_worker, index=job.index, count=job.count, severity=job.severity)
 
 
 def _scenes(

@@ -152,7 +152,7 @@ def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendered
     return rendered
 
 
-def _inside(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def inside_image(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Slices of the image and of the box for the part of a box that lies in the image."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
@@ -162,7 +162,7 @@ def _inside(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, s
 
 def _paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
     """Draw one patch in place; return the fraction of it that lies in the image."""
-    there, here = _inside(mask.box, image)
+    there, here = inside_image(mask.box, image)
     disc = mask.disc[here]
     ink = white * disc - (white - black) * mask.black[here]
     below = 1.0 - disc
@@ -181,7 +181,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """
     contrast = np.full(len(masks), np.nan)
     for n, mask in enumerate(masks):
-        there, here = _inside(mask.box, image)
+        there, here = inside_image(mask.box, image)
         grey = image[there] if image.ndim == 2 else image[there].mean(axis=2)
         inside = mask.disc[here] > 1 - 1e-6
         share, grey = mask.black[here][inside], grey[inside].astype(np.float64)

@@ -130,6 +130,8 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: Paper, copi
         )
     placed = [patch for patch in patches for _ in range(copies)]
     columns = min(columns, len(placed))
+    labels = {p: f"{p.name}, id {p.patch_id}, {p.digest[:8]}" for p in patches}
+    label_size = min(_fitting(label, cell_x - 1.0) for label in labels.values())
     on_page = rows * columns
     pages: list[Page] = []
     keypoints: list[dict[str, Any]] = []
@@ -141,7 +143,7 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: Paper, copi
             x = paper.width / 2 + (n % columns + 0.5 - columns / 2) * cell_x
             y = MARGIN + n // columns * cell_y + cell_x / 2
             shapes += [_ink(patch, x, y, diameter_mm, 0.0), *_disc_marks(x, y, patch.extent * diameter_mm / 2)]
-            texts.append(_label(patch, x, y + cell_x / 2 + LABEL_ROOM / 2, cell_x))
+            texts.append(Text(labels[patch], x, y + cell_x / 2 + LABEL_ROOM / 2, label_size, "middle"))
             keypoints.append(_entry(len(keypoints), patch, 0.0, diameter_mm, number, paper.seen(x, y)))
         pages.append(paper.page(shapes, texts, title))
     digest = hashlib.sha256(repr((nm(diameter_mm), [(p.patch_id, p.digest) for p in patches])).encode()).hexdigest()
@@ -258,14 +260,17 @@ def _frame(paper: Paper, title: str, foot: str) -> tuple[list[Shape], list[Text]
         Shape(_polygon((inner - v, height - MARGIN - u) for u, v in _comb(ruler_y)), MARKS),
     ]
     check = f"print at 100 %, check with a ruler: {ruler_x:g} mm"
-    size = _fitting(f"{title}    {check}", paper.room[0])
     end, bottom = MARGIN + ruler_x, height - BLANK - 0.6
+    foot_size = _fitting(foot, width - MARGIN - end - 12)
+    if foot_size < 1.2:  # a small page: no room beside the ruler
+        title, foot = f"{title}, {foot}", ""
+    size = _fitting(f"{title}    {check}", paper.room[0])
     x, y = BLANK + STRIP / 2, height - MARGIN - ruler_y
     texts = [
         Text(title, MARGIN, BLANK + size, size),
         Text(check, width - MARGIN, BLANK + size, size, "end"),
         Text(f"{ruler_x:g} mm", end + 1.5, bottom, FONT_SIZE),
-        Text(foot, width - MARGIN, bottom, _fitting(foot, width - MARGIN - end - 12), "end"),
+        Text(foot, width - MARGIN, bottom, foot_size, "end"),
         Text(f"{ruler_y:g}", x, y - 3.2, 1.7, "middle"),
         Text("mm", x, y - 1.2, 1.7, "middle"),
     ]
@@ -314,11 +319,6 @@ def _on_page(tile: Tile, paper: Paper, x: float, y: float) -> tuple[float, float
 
 def _ink(patch: Patch, x: float, y: float, diameter: float, rotate_deg: float) -> Shape:
     return Shape(move(patch.black_region, x, y, diameter / 2, rotate_deg), INK)
-
-
-def _label(patch: Patch, x: float, y: float, room: float) -> Text:
-    text = f"{patch.name}, id {patch.patch_id}, {patch.digest[:8]}"
-    return Text(text, x, y, _fitting(text, room - 1.0), "middle")
 
 
 def _disc_marks(x: float, y: float, radius: float) -> list[Shape]:

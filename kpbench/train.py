@@ -23,13 +23,11 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-import cv2
 import numpy as np
 import torch
 import torch.distributed as dist
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
 
 from kpbench import __version__
 from kpbench.design import Patch, shipped_patches
@@ -37,14 +35,12 @@ from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
 from kpbench.network import CELL, NetworkConfig, SuperPoint, initialise, read_weights
-from kpbench.samples import Batch, SampleConfig, load_photos, make_batch
+from kpbench.samples import Batch, Job, SampleConfig, load_photos, make_batch, stream
 from kpbench.store import canonical_json, write_atomic
 
-__all__ = ["Loss", "Phase", "Recipe", "designs_digest", "evaluate", "load_recipe", "read_checkpoint", "train"]
+__all__ = ["Loss", "Phase", "Recipe", "designs_digest", "evaluate", "load_recipe", "network_of", "read_checkpoint", "train"]
 
 SCHEMA = "kpbench.checkpoint/1"
-VALIDATION_EVERY = 10
-"""Of a folder of photographs every tenth is kept for validation."""
 
 
 @dataclass(frozen=True)
@@ -386,6 +382,13 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     return content, tensors
 
 
+def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
+    """The running mean of a checkpoint as a network in evaluation mode."""
+    network = SuperPoint(_parse(Recipe, content["recipe"], "checkpoint", "recipe").network)
+    network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
+    return network.eval()
+
+
 def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
     """Put a checkpoint into a freshly started state.
 
@@ -395,8 +398,8 @@ def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
         If it cannot be read, or belongs to another recipe or other designs.
     """
     content, tensors = read_checkpoint(path)
-    theirs, ours = content["recipe"], json.loads(json.dumps(asdict(state.recipe)))
-    changed = [key for key in ours if ours[key] != theirs.get(key)]
+    theirs = _parse(Recipe, content["recipe"], str(path), "recipe")
+    changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(state.recipe, f.name)]
     if changed:
         raise DataError(f"{path}: was trained with another {' and '.join(changed)}; use another folder with --out")
     if content["designs"] != designs_digest(patches):
@@ -420,33 +423,6 @@ def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
 
 
 # The loop ----------------------------------------------------------------------------------------------
-
-
-class Batches(Dataset[Batch]):
-    """Batch ``n`` of this process at index ``n``, for a DataLoader's workers."""
-
-    def __init__(self, recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], rank: int, world: int) -> None:
-        self.recipe, self.patches, self.photos, self.rank, self.world = recipe, patches, photos, rank, world
-
-    def __getitem__(self, step: int) -> Batch:
-        cv2.setNumThreads(1)
-        recipe, _ = self.recipe, None
-        _, severity = recipe.phase(step)
-        index, count = step * self.world + self.rank, recipe.batch // self.world
-        return make_batch(recipe.samples, self.patches, self.photos, recipe.seed, index, count, severity)
-
-
-def _batches(data: Batches, first: int, workers: int, pin: bool) -> Iterator[tuple[Tensor, Tensor]]:
-    loader: Any = DataLoader(
-        data,
-        batch_size=None,
-        sampler=range(first, data.recipe.steps),
-        num_workers=workers,
-        prefetch_factor=4 if workers else None,
-        pin_memory=pin,
-    )
-    for images, keypoints in loader:
-        yield torch.as_tensor(images), torch.as_tensor(keypoints)
 
 
 def step_once(state: State, forward: nn.Module, images: Tensor, keypoints: Tensor, world: int) -> tuple[Tensor, Tensor]:
@@ -586,19 +562,21 @@ def train(
     elif init is not None:
         say(initialise(state.network, read_weights(init), str(init)))
         state.mean.load_state_dict(state.network.state_dict())
-    photos = load_photos(backgrounds)
-    held_out = photos[::VALIDATION_EVERY] if len(photos) > 1 else photos
-    seen = [p for n, p in enumerate(photos) if n % VALIDATION_EVERY] or photos
+    held_out = load_photos(backgrounds, "validation") if rank == 0 else []
     validation = validation_set(recipe, designs, held_out) if rank == 0 else None
+    jobs = (
+        Job(step * world + rank, recipe.batch // world, recipe.phase(step)[1])
+        for step in range(state.step, recipe.steps)
+    )
     forward: nn.Module = torch.compile(state.network) if recipe.compile else state.network  # type: ignore[assignment]
 
     with _recorder(folder, rank == 0, tensorboard) as record, _bar(state, rank) as advance, _stop_on_signal() as signalled:
         saved = validated = noted = time.monotonic()
         before, first = state.seconds, state.step
         sums, since = torch.zeros(2, device=device), state.step
-        data = Batches(recipe, designs, seen, rank, world)
-        for images, keypoints in _batches(data, state.step, workers, device.type == "cuda"):
-            pair = step_once(state, forward, images.to(device), keypoints.to(device), world)
+        for batch in stream(recipe.samples, designs, backgrounds, recipe.seed, jobs, workers):
+            images, keypoints = (torch.from_numpy(part).to(device) for part in batch)
+            pair = step_once(state, forward, images, keypoints, world)
             sums += torch.stack(pair)
             now = time.monotonic()
             state.seconds = before + now - began

@@ -243,3 +243,19 @@ def test_pdf_holds_no_image(tmp_path):
     (tmp_path / "a.pdf").write_bytes(pdf([page_of(PIE)]))
     done = subprocess.run(["pdfimages", "-list", tmp_path / "a.pdf"], capture_output=True, text=True, check=True)
     assert len(done.stdout.splitlines()) == 2, "a header and nothing below"
+
+
+@pytest.mark.skipif(not shutil.which("pdftoppm"), reason="needs poppler")
+def test_mirrored_pages_are_mirror_images_text_and_all(tmp_path):
+    page = Page(100, 50, (), (Text("RE", 10, 40, 24), Text("FL", 95, 40, 24, "end")), "")
+    for name, drawn in (("a", page), ("b", mirror(page))):
+        (tmp_path / f"{name}.pdf").write_bytes(pdf([drawn]))
+        subprocess.run(["pdftoppm", "-r", "127", "-gray", "-singlefile", f"{name}.pdf", name], cwd=tmp_path, check=True)
+    for straight, mirrored in (
+        [np.asarray(Image.open(tmp_path / f"{name}.pgm")) for name in ("a", "b")],
+        [np.asarray(Image.open(io.BytesIO(png(drawn, 127)))) for drawn in (page, mirror(page))],
+    ):
+        ink, seen = (255.0 - grey[:250, :500] for grey in (straight, mirrored))  # poppler adds a row and a column
+        assert np.abs(ink - seen[:, ::-1]).sum() < 0.15 * ink.sum()
+        assert np.abs(ink - seen).sum() > ink.sum()
+    assert svg(mirror(page)).count(b"matrix(-1 0 0 1 ") == 2

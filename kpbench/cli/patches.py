@@ -32,6 +32,7 @@ class Measured(click.ParamType[tuple[float, float]]):
 @click.option(
     "--diameter-mm",
     type=click.FloatRange(0.1, 5000),
+    metavar="MM",
     help="Diameter of the disc; rim and quiet zone come on top. A hexagon's side is DIAMETER / 0.16.  [default: 30]",
 )
 @click.option("--page", default="a4", show_default=True, help="a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
@@ -83,7 +84,7 @@ def render_patches(
     Examples:
       kpbench render-patches --pdf
       kpbench render-patches --svg --dxf --diameter-mm 50 --design my-patch.toml
-      kpbench render-patches --board hexagon --patch checker
+      kpbench render-patches --board hexagon --patch 0
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
       kpbench render-patches --measured 99.8,100.1
     """
@@ -91,7 +92,8 @@ def render_patches(
 
     from kpbench.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
     from kpbench.design import load_patches, shipped_patches
-    from kpbench.sheet import board_sheet, parse_paper, patch_sheet, save_sheet
+    from kpbench.errors import DesignError
+    from kpbench.sheet import board_sheet, file_stem, parse_paper, patch_sheet, save_sheet
     from kpbench.sidecar import correct_sidecars
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
@@ -121,8 +123,13 @@ def render_patches(
         sheets = [board_sheet(b, paper, tile) for b in boards]
     elif board == "grid":
         sheets = [board_sheet(grid_board(patches, 4, 3, diameter, GRID_PITCH * diameter), paper, tile)]
+    elif not Path(board).is_file():
+        raise DesignError(f"{board}: no such file, expected hexagon, grid or a board's TOML file")
     else:
         sheets = [board_sheet(load_board(board, own, diameter_mm), paper, tile)]
+    stems = [file_stem(one.name) for one in sheets]
+    if twice := [stem for stem in stems if stems.count(stem) > 1]:
+        raise DesignError(f"two boards would be written to {twice[0]}; choose one with --patch ID")
     suffixes = [s for s, wanted in {".pdf": pdf, ".svg": svg, ".png": png, ".dxf": dxf}.items() if wanted]
     for one in tqdm(sheets, disable=not (png and sys.stderr.isatty()), leave=False):
         for path in save_sheet(one, out, suffixes or [".pdf"], dpi):

@@ -1,0 +1,81 @@
+"""Commands that make the weights of the reference detector."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["export_model", "train"]
+
+INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
+
+
+@click.command()
+@click.option("--config", type=click.Path(path_type=Path), required=True, help="Recipe, TOML.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder of the run; default: runs/NAME of the recipe.")
+@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.option("--init", type=click.Path(path_type=Path), help="SuperPoint weights to start from (.pth, .safetensors).")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder.")
+@click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
+@click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes making samples.")
+@click.option("--threads", type=click.IntRange(min=1), help="Threads of PyTorch.")
+@click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard too.")
+def train(
+    config: Path,
+    out: Path | None,
+    backgrounds: Path | None,
+    init: Path | None,
+    resume: bool,
+    minutes: float | None,
+    workers: int,
+    threads: int | None,
+    tensorboard: bool,
+) -> None:
+    """Train the detector on samples that are made on the fly; any run can be resumed to the bit.
+
+    \b
+    Example:
+      kpbench train --config configs/reference.toml --backgrounds photos/ --minutes 30
+      kpbench train --config configs/reference.toml --backgrounds photos/ --resume
+      torchrun --nproc-per-node 4 -m kpbench train --config configs/reference.toml --workers 4
+    """
+    if init and resume:
+        raise click.UsageError("--init and --resume exclude each other: a checkpoint holds its own weights")
+    try:
+        from kpbench import train as training
+    except ModuleNotFoundError as error:
+        raise click.ClickException(f"kpbench train {INSTALL} ({error})") from None
+    recipe = training.load_recipe(config)
+    folder = out or Path("runs") / recipe.name
+    finished = training.train(
+        recipe,
+        folder,
+        backgrounds,
+        init=init,
+        resume_run=resume,
+        minutes=minutes,
+        workers=workers,
+        threads=threads,
+        tensorboard=tensorboard,
+        say=lambda line: click.echo(line, err=True),
+    )
+    click.echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
+
+
+@click.command("export-model")
+@click.argument("checkpoint", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="ONNX file to write.")
+def export_model(checkpoint: Path, out: Path) -> None:
+    """Write the trained network as one ONNX file, and check it against PyTorch.
+
+    \b
+    Example:
+      kpbench export-model runs/superpoint-small/checkpoint.safetensors --out superpoint-small.onnx
+    """
+    try:
+        from kpbench.export import export
+    except ModuleNotFoundError as error:
+        raise click.ClickException(f"kpbench export-model {INSTALL} ({error})") from None
+    done = export(checkpoint, out)
+    click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from PyTorch by at most {done.difference:.1e}")

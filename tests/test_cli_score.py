@@ -1,0 +1,230 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kpbench.cli import main
+from kpbench.keypoints import KEYPOINT_DTYPE, Detections
+from kpbench.predictions import Predictions, write_predictions
+from kpbench.score import COUNTS, METRICS
+from kpbench.store import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_atomic, write_manifest
+
+
+def write_dataset(folder, images, condition="", seed=0):
+    """A dataset of tiny images; each entry is a list of (x, y, radius, id)."""
+    folder.mkdir()
+    samples = []
+    for n, rows in enumerate(images):
+        keypoints = np.zeros(len(rows), KEYPOINT_DTYPE)
+        for k, (x, y, radius, patch_id) in enumerate(rows):
+            keypoints[k]["x"], keypoints[k]["y"], keypoints[k]["patch_id"] = x, y, patch_id
+            keypoints[k]["radius_major"] = keypoints[k]["radius_minor"] = radius
+        rung = float(n % 2) if condition else float("nan")
+        samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
+    config = {"seed": seed}
+    path = folder / "shard-00000.h5"
+    write_atomic(path, encode_shard(samples, config))
+    write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
+    return open_dataset(folder)
+
+
+IMAGES = [[(10, 10, 10, 0), (50, 10, 10, 1)], [(10, 10, 10, 0)], [], [(30, 30, 20, 1)]]
+
+
+def perfect(images=IMAGES, **about):
+    return Predictions.from_detections(
+        [Detections([r[:2] for r in rows], [1.0] * len(rows), [r[3] for r in rows]) for rows in images], **about
+    )
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def kpbench(*args, code=0):
+    result = CliRunner().invoke(main, ["score", *map(str, args)])
+    assert result.exit_code == code, result.output
+    assert code == 0 or "Traceback" not in result.output
+    return result
+
+
+def complaint(*args):
+    """The one line of an error."""
+    lines = kpbench(*args, code=1).stderr.splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+def test_the_plain_call_finds_kpbench_data(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    write_predictions("preds.json", perfect(detector={"name": "oracle", "version": "2"}))
+    result = kpbench("preds.json")
+    assert result.stderr == ""
+    lines = result.stdout.splitlines()
+    assert lines[0] == "predictions  preds.json, oracle 2"
+    assert "keypoints    4: 4 matched (0 with a wrong ID), 0 missed" in lines
+    assert "detection score                1.0000 [1.0000, 1.0000]" in lines
+    assert "false alarms an image          0.0000 [0.0000, 0.0000]" in lines
+    assert "as printed" not in result.stdout  # nothing differs
+
+
+def test_undefined_is_na_and_the_printed_reading_is_shown_where_it_differs(here):
+    write_dataset(here / "kpbench-data", IMAGES, condition="blur")
+    twice = Detections([[10, 10], [10.5, 10]], [1, 0.5], [0, 0])
+    none = Detections.none()
+    write_predictions("p.json", Predictions.from_detections([twice, none, none, none]))
+    lines = kpbench("p.json").stdout.splitlines()
+    rows = {tuple(line.split()[:3]): line.split() for line in lines if line.startswith(("blur ", "all "))}
+    assert next(line for line in lines if line.startswith("detection score")).startswith(
+        "detection score                0.25"
+    )
+    assert next(line for line in lines if line.startswith("detection score, as")).split()[4] == "0.5000"
+    assert rows["blur", "1", "all"][4:] == [
+        "0.0000",
+        "[0.0000,",
+        "0.0000]",
+        "n/a",
+        *["0.0000", "[0.0000,", "0.0000]"] * 3,
+        "n/a",
+    ]
+    assert list(rows) == [
+        ("blur", "0", "all"), ("blur", "1", "all"), ("blur", "0", "0"), ("blur", "0", "1"), ("blur", "1", "0"),
+        ("blur", "1", "1"), ("all", "all", "0"), ("all", "all", "1"),
+    ]  # fmt: skip
+    literal = kpbench("p.json", "--matching", "literal").stdout
+    assert "detection score                0.5000" in literal
+
+
+def test_files_hold_what_the_screen_shows(here):
+    data = write_dataset(here / "kpbench-data", IMAGES, condition="blur")
+    write_predictions("p.json", perfect(detector={"name": "oracle"}))
+    args = ["p.json", "--json", "s.json", "--csv", "s.csv", "--eps", "0.2", "--eps-radius", "minor"]
+    kpbench(*args)
+    content = json.loads((here / "s.json").read_text())
+    assert content["schema"] == "kpbench.scores/1"
+    assert content["dataset"] == {"fingerprint": data.fingerprint, "images": 4}
+    assert content["detector"] == {"name": "oracle"}
+    assert content["settings"]["eps"] == 0.2
+    assert content["settings"]["eps_radius"] == "minor"
+    assert content["settings"]["matching"] == "one-to-one"
+    assert set(content["metrics"]) == {*METRICS, "counts", "intervals"}
+    assert tuple(content["metrics"]["counts"]) == COUNTS
+    assert content["metrics"]["detection_score"] == 1
+    assert content["by"][0]["condition"] == "blur"
+    assert content["provenance"]["predictions"] == {"file": "p.json", "sha256": sha256_of(here / "p.json")}
+    with (here / "s.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 1 + len(content["by"])
+    assert [rows[0][k] for k in ("condition", "rung", "patch_id")] == ["", "", ""]
+    for row, group in zip(rows[1:], content["by"], strict=True):
+        assert row["rung"] == ("" if group["rung"] is None else str(group["rung"]))
+        for name in METRICS:
+            value = group["metrics"][name]
+            assert (float(row[name]) if row[name] else None) == value
+    before = (here / "s.json").read_bytes()
+    kpbench(*args)
+    assert (here / "s.json").read_bytes() == before
+
+
+def test_where_the_dataset_is_found(here):
+    write_dataset(here / "kpbench-data", [[(10, 10, 10, 0)]] * 2)
+    other = write_dataset(here / "other", IMAGES)
+    (here / "sub").mkdir()
+    write_dataset(here / "sub" / "beside", [[]])
+
+    def images(*args):
+        return next(line.split()[1] for line in kpbench(*args).stdout.splitlines() if line.startswith("images"))
+
+    write_predictions("p.json", perfect())
+    assert images("p.json", "--gt", "other") == "4"
+    write_predictions("p.json", perfect(dataset="other"))
+    assert images("p.json") == "4"
+    write_predictions("sub/p.json", perfect([[]], dataset="beside"))
+    assert images("sub/p.json") == "1"
+    write_predictions("p.json", perfect([[]] * 2, dataset="gone"))
+    result = kpbench("p.json")
+    assert (
+        result.stderr == "kpbench: p.json names the dataset 'gone', which is not here; scoring against ./kpbench-data\n"
+    )
+    write_predictions("p.json", perfect(dataset=other.fingerprint))
+    assert images("p.json", "--gt", "other") == "4"
+    mark = open_dataset("kpbench-data").fingerprint
+    assert complaint("p.json") == (
+        f"kpbench: p.json does not fit kpbench-data: made for the dataset with fingerprint "
+        f"{other.fingerprint[:12]}…, but this dataset's is {mark[:12]}…"
+    )
+
+
+def test_without_any_dataset_the_way_out_is_named(here):
+    write_predictions("p.json", perfect())
+    assert complaint("p.json") == (
+        "kpbench: p.json: names no dataset, and there is no ./kpbench-data; name one with --gt"
+    )
+    write_predictions("p.json", perfect(dataset="gone"))
+    assert "names the dataset 'gone', which is not here, and there is no" in complaint("p.json")
+    assert complaint("p.json", "--gt", "gone").startswith("kpbench: gone: no dataset there")
+
+
+def test_images_must_be_the_same(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    write_predictions("few.json", perfect(IMAGES[:3]))
+    assert complaint("few.json") == (
+        "kpbench: few.json does not fit kpbench-data: no prediction for image_id 3; 1 of 4 images are missing "
+        "(--allow-missing takes them as images without detections)"
+    )
+    assert "4: 3 matched" in kpbench("few.json", "--allow-missing").stdout
+    write_predictions("many.json", perfect([*IMAGES, []]))
+    assert complaint("many.json", "--allow-missing").startswith(
+        "kpbench: many.json does not fit kpbench-data: image_id 4 is not in the dataset (4 images, image_id 0 to 3)"
+    )
+
+
+def test_bad_predictions_are_one_line(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    (here / "p.json").write_text(
+        '{"schema": "kpbench.predictions/1", "predictions": [{"image_id": 12, "keypoints": [[1, 2], [NaN, 4.0]]}]}'
+    )
+    assert complaint("p.json") == (
+        "kpbench: p.json: predictions[0] (image_id 12): keypoints[1] is [nan, 4.0], expected two finite numbers"
+    )
+    assert complaint("none.json") == "kpbench: none.json: cannot be read, No such file or directory"
+
+
+def test_gates(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    write_predictions("p.json", perfect([*IMAGES[:3], [(0, 0, 1, 1)]]))
+    kpbench("p.json", "--min", "detection_score=0.75", "--max", "average_false_alarm=0.25")
+    result = kpbench(
+        "p.json", "--min", "detection_score=0.8", "--max", "average_false_alarm=0.2", "--json", "s.json", code=1
+    )
+    assert result.stderr == (
+        "kpbench: detection_score is 0.75, expected at least 0.8; average_false_alarm is 0.25, expected at most 0.2\n"
+    )
+    assert "detection score                0.7500" in result.stdout  # the scores are shown and written all the same
+    assert (here / "s.json").exists()
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["--min", "detection=1"],
+        ["--min", "detection_score"],
+        ["--min", "detection_score=high"],
+        ["--max", "recall=nan"],
+        ["--eps", "-1"],
+        ["--eps-radius", "x"],
+        ["--matching", "x"],
+    ],
+)
+def test_wrong_usage_is_exit_2(here, args):
+    assert "Usage" in kpbench("p.json", *args, code=2).stderr
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    write_predictions("p.json", perfect())
+    assert "no/s.json: cannot be written" in complaint("p.json", "--json", "no/s.json")
