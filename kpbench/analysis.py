@@ -118,11 +118,10 @@ def bound(
         parts = images(cells, np.array(poses), half, blur_px, sums)
     else:
         parts = sums @ images(cells, np.array(poses), half, blur_px)
-    whole = parts[:, -1]
     if not rim:
-        parts = parts[:, :, np.all(whole > 1 - 1e-5, axis=0)]
-    parts = parts.astype(np.float64).transpose(1, 0, 2)
-    black, whole = parts[:-1], parts[-1]
+        parts = parts[:, :, np.all(parts[:, -1] > 1 - 1e-5, axis=0)]
+    exact = parts.astype(np.float64).transpose(1, 0, 2)
+    black, whole = exact[:-1], exact[-1]
     image = 0.5 * whole - black  # white is 1/2, black is -1/2, what surrounds them is 0
     geometric = (image[:, 1::2] - image[:, 2::2]) / (2 * step)
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
@@ -257,7 +256,7 @@ def symmetry_order(patch: Patch) -> int:
     width = np.diff(np.append(angles, angles[0] + 360.0))
     shifts = range(len(angles))
     same = (np.allclose(np.roll(width, k), width) and (np.roll(black, k, axis=1) == black).all() for k in shifts)
-    return sum(same)
+    return int(sum(same))
 
 
 # --- Nature -------------------------------------------------------------------------------------------
@@ -319,7 +318,7 @@ def natural_response(grid: Grid, inks: Float32, windows: UInt8, blur: float = 0.
     best = np.zeros((len(inks), nature.shape[1]), np.float32)
     for cells in seen_cells(grid, attitudes(), 1.0, blur=blur):
         image, own_spread = moments(weight, cells, inks)
-        np.maximum(best, (image / own_spread[:, None]) @ nature, out=best)
+        np.maximum(best, (-image / own_spread[:, None]) @ nature, out=best)  # ink is dark
     return np.array([(best > limit).sum(1) / len(windows) for limit in LOOKS_ALIKE]).T
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
@@ -27,6 +28,9 @@ __all__ = ["Look", "Pose", "board_keypoints", "outline_px", "polygon_area", "pos
 
 EDGE = 0.008  # of the board's shorter side: the band along its cut edge
 MARGIN = 0.01  # of the image's width, kept free around the board
+SHADOW_REACH = 0.4  # board sides that the shadow is moved for a slope of 1
+SHADOW_SOFT = 0.05  # standard deviation of its edge, board sides
+SHADOW_GRID = 64  # a board side in pixels of the grid on which the shadow is made, before it is enlarged
 PIECE_PX = 8.0  # longest straight piece of a projected outline where the lens bends lines
 
 
@@ -54,6 +58,8 @@ class Look:
     light : brightness at the board's centre, 0 to 1.
     slope : change of brightness over one board side (the root of its projected area), to the right and
         downwards in the image; light is clipped to [0, 1].
+    shadow : share of the light that the board takes from the scene right behind it, soft-edged; it falls
+        away from the lamp, against the slope.
     """
 
     black: float
@@ -61,6 +67,7 @@ class Look:
     edge: float = 0.9
     light: float = 1.0
     slope: tuple[float, float] = (0.0, 0.0)
+    shadow: float = 0.0
 
 
 def polygon_area(points: Float) -> float:
@@ -191,7 +198,8 @@ def _moments_ellipse(points: Float) -> Ellipse:
     values, vectors = np.linalg.eigh((second + mixed + mixed.T) / area - np.outer(centroid, centroid))
     minor, major = 2 * np.sqrt(values)
     angle_deg = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180)
-    return Ellipse(*(float(v) for v in middle + centroid), float(major), float(minor), angle_deg)
+    x, y = middle + centroid
+    return Ellipse(float(x), float(y), float(major), float(minor), angle_deg)
 
 
 def render_board(background: UInt8, camera: Camera, pose: Pose, board: Board, look: Look) -> Rendered:
@@ -222,18 +230,20 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: Board, lo
     covers = coverage(regions, boxes)
     masks = tuple(Mask(boxes[n], covers[n], covers[n + 1]) for n in range(2, len(boxes), 2))
 
-    there, here = inside_image(boxes[0], background)
+    image, side_px = background.copy(), float(np.sqrt(polygon_area(edge)))
+    if look.shadow:
+        _cast_shadow(image, edge, side_px, look)
+    there, here = inside_image(boxes[0], image)
     below, face_cover = 1.0 - covers[0], covers[1]
     ink = look.white * (look.edge * (covers[0] - face_cover) + face_cover)
     x0, y0 = boxes[0][:2]
     for mask in masks:
         x, y, w, h = mask.box
         ink[y - y0 : y - y0 + h, x - x0 : x - x0 + w] -= (look.white - look.black) * mask.black
-    ink *= _light(look, boxes[0], to_px(camera, pose, np.zeros((1, 2)))[0], np.sqrt(polygon_area(edge)))
+    ink *= _light(look, boxes[0], to_px(camera, pose, np.zeros((1, 2)))[0], side_px)
     ink, below = ink[here], below[here]
     if background.ndim == 3:
         ink, below = ink[..., None], below[..., None]
-    image = background.copy()
     image[there] = np.rint(image[there] * below + ink).astype(np.uint8)
     for n, mask in enumerate(masks):
         keypoints[n]["visible"] = mask.disc[inside_image(mask.box, image)[1]].sum() / mask.disc.sum()
@@ -246,4 +256,19 @@ def _light(look: Look, box: Box, centre_px: Float, side_px: float) -> Float:
     x, y, w, h = box
     across = (np.arange(x, x + w) - centre_px[0]) * (look.slope[0] / side_px)
     down = (np.arange(y, y + h) - centre_px[1]) * (look.slope[1] / side_px)
-    return np.clip(look.light + across + down[:, None], 0.0, 1.0)
+    return np.asarray(np.clip(look.light + across + down[:, None], 0.0, 1.0))
+
+
+def _cast_shadow(image: UInt8, edge_px: Float, side_px: float, look: Look) -> None:
+    """Darken the scene behind the board, in place; smooth, and hence made on a coarse grid and enlarged."""
+    step = max(1, round(side_px / SHADOW_GRID))
+    soft = SHADOW_SOFT * side_px / step
+    moved = (edge_px - SHADOW_REACH * side_px * np.asarray(look.slope) + 0.5) / step - 0.5
+    x, y, w, h = box_around([moved])
+    grow = int(np.ceil(3 * soft))
+    box = (x - grow, y - grow, w + 2 * grow, h + 2 * grow)
+    taken = cv2.GaussianBlur(coverage([[moved]], [box])[0].astype(np.float32), (0, 0), soft)
+    fine = cv2.resize(taken, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+    there, here = inside_image((box[0] * step, box[1] * step, fine.shape[1], fine.shape[0]), image)
+    kept = 1 - np.float32(look.shadow) * fine[here]
+    image[there] = np.rint(image[there] * (kept if image.ndim == 2 else kept[..., None])).astype(np.uint8)

@@ -155,33 +155,33 @@ def images(
     -------
     ndarray of shape (P, len(polygons) or M, (2 * half + 1)**2), float32
     """
-    side = 2 * half + 1
-    out = np.empty((len(poses), len(polygons) if mix is None else len(mix), side * side), np.float32)
-    margin = half + (int(np.ceil(4 * blur_px)) + 1 if blur_px else 0)
-    for pose, image in zip(poses, out, strict=True):
+    wide = half + (int(np.ceil(4 * blur_px)) if blur_px else 0)
+    out = []
+    for pose in poses:
         placed = [p @ pose[:, :2].T + pose[:, 2] for p in polygons]
-        x, y, w, h = box_around(placed)
-        reach = max(-x, -y, x + w - 1, y + h - 1, margin)
-        box = (-reach, -reach, 2 * reach + 1, 2 * reach + 1)
-        covered = np.array(coverage([[p] for p in placed], [box] * len(placed)), np.float32)
-        covered = covered[:, reach - margin : reach + margin + 1, reach - margin : reach + margin + 1]
+        boxes = [box_around([p]) for p in placed]
+        covered = np.zeros((len(polygons), 2 * wide + 1, 2 * wide + 1), np.float32)
+        for window, part, (x, y, w, h) in zip(covered, coverage([[p] for p in placed], boxes), boxes, strict=True):
+            left, top = max(-wide, x), max(-wide, y)
+            right, bottom = min(wide + 1, x + w), min(wide + 1, y + h)
+            if left < right and top < bottom:
+                seen = part[top - y : bottom - y, left - x : right - x]
+                window[top + wide : bottom + wide, left + wide : right + wide] = seen
         if mix is not None:
             covered = np.tensordot(mix, covered, 1)
-        image[:] = blurred(covered, blur_px, half).reshape(len(image), -1)
-    return out
+        out.append(blurred(covered, blur_px, half).reshape(len(covered), -1))
+    return np.array(out, np.float32)
 
 
 def blurred(stack: Float32, blur_px: float, half: int) -> Float32:
-    """The middle ``2 * half + 1`` pixels of blurred images, (N, H, W)."""
-    import cv2
-
-    if blur_px:
-        side = 2 * int(np.ceil(4 * blur_px)) + 1
-        stack = np.array(
-            [cv2.GaussianBlur(image, (side, side), blur_px, borderType=cv2.BORDER_REPLICATE) for image in stack]
-        )
-    cut = stack.shape[1] // 2 - half
-    return stack[:, cut : cut + 2 * half + 1, cut : cut + 2 * half + 1]
+    """The middle ``2 * half + 1`` pixels of blurred square images, (N, side, side), free of border effects."""
+    wide = stack.shape[1] // 2
+    if not blur_px:
+        return stack[:, wide - half : wide + half + 1, wide - half : wide + half + 1]
+    away = np.arange(-wide, wide + 1) - np.arange(-half, half + 1)[:, None]
+    kernel = np.where(np.abs(away) <= 4 * blur_px, np.exp(-0.5 * (away / blur_px) ** 2), 0.0)
+    kernel = (kernel / kernel.sum(1, keepdims=True)).astype(np.float32)
+    return np.asarray(kernel @ stack @ kernel.T)
 
 
 def _poses(attitude: Float, shift_px: tuple[float, float] = (0.0, 0.0)) -> Float:

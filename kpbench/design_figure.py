@@ -10,7 +10,7 @@ from kpbench.analysis import SIZES_PX, Analysis, DesignReport
 from kpbench.cells import SEEN_PX, Grid, images
 from kpbench.design import Patch
 from kpbench.draw import Page, Shape, Text
-from kpbench.outline import circle, move, rectangle
+from kpbench.outline import Arc, circle, move, rectangle
 
 __all__ = ["design_figure"]
 
@@ -40,7 +40,7 @@ def design_figure(analysis: Analysis, patches: Sequence[Patch]) -> Page:
         texts.append(Text(f"{report.patch_id} {report.name}", LEFT, top + 2 * ICON + 5, 1.3 * FONT))
         texts.append(Text(_line(report), LEFT, top + 2 * ICON + 9.5, FONT))
         bars = [(f"r = {r:g} px", report.bound_at(r).worst_px, FULL_BOUND_PX) for r in SIZES_PX]
-        bars += [(f"r = {SIZES_PX[0]:g} px, 60° tilt", report.bound_at(SIZES_PX[0], 60.0).worst_px, FULL_BOUND_PX)]
+        bars += [(f"r = {SIZES_PX[0]:g} px, tilted 60 deg", report.bound_at(SIZES_PX[0], 60.0).worst_px, FULL_BOUND_PX)]
         bars += [("basin", report.basin, FULL_DISTANCE)]
         others = [
             (f"{other.patch_id} {other.name}", float(analysis.distance[n, k]), FULL_DISTANCE)
@@ -65,15 +65,9 @@ def _line(report: DesignReport) -> str:
 
 
 def _icon(patch: Patch, x: float, y: float) -> list[Shape]:
-    scale = ICON / patch.extent
-    rim = move(circle(x, y, ICON + 0.15) + _hole(x, y, ICON - 0.05), 0, 0)
-    return [Shape(move(patch.black_region, x, y, scale)), Shape(rim)]
-
-
-def _hole(x: float, y: float, radius: float) -> tuple[tuple, ...]:  # type: ignore[type-arg]
-    from kpbench.outline import Arc
-
-    return ((Arc(x, y, radius, 0.0, -360.0),),)
+    """The design, with a hairline around it."""
+    hairline = (*circle(x, y, ICON + 0.1), (Arc(x, y, ICON, 0.0, -360.0),))
+    return [Shape(move(patch.black_region, x, y, ICON / patch.extent)), Shape(hairline)]
 
 
 def _pixels(patch: Patch, x: float, y: float) -> list[Shape]:

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from kpbench.detectors.superpoint import SCHEMA
+from kpbench.detectors.superpoint import SCHEMA, open_session
 from kpbench.errors import DataError
 from kpbench.network import CELL, SuperPoint
 from kpbench.store import write_atomic
@@ -108,8 +108,5 @@ def export(checkpoint: str | Path, out: str | Path) -> Exported:
 
 
 def _difference(data: bytes, image: Any, expected: list[Any]) -> float:
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(data, providers=["CPUExecutionProvider"])
-    got = session.run(None, {"image": image})
+    got = open_session(data).run(None, {"image": image})
     return max(float(np.abs(a - b).max()) for a, b in zip(got, expected, strict=True))

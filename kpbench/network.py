@@ -1,4 +1,4 @@
-"""The network: SuperPoint with an attached layer on each head (paper §2.2), its widths as data.
+"""The network and its losses: SuperPoint with an attached layer on each head (paper §2.2), widths as data.
 
 A VGG encoder brings the image to cells of 8x8 pixels. The detector head gives 65 logits a cell: one a
 pixel of the cell, in row order, and one for "no keypoint". The descriptor head, 256 wide, ends in an
@@ -19,56 +19,19 @@ from pathlib import Path
 from typing import cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kpbench.errors import DataError
+from kpbench.recipe import Loss, NetworkConfig
 
-__all__ = ["CELL", "NetworkConfig", "SuperPoint", "initialise", "read_weights"]
+__all__ = ["CELL", "SuperPoint", "Targets", "initialise", "losses", "make_targets", "read_weights"]
 
 CELL = 8
 """Side of a cell, px: three stages of the encoder halve the image."""
 
 NO_KEYPOINT_PRIOR = 0.98
 """Probability of "no keypoint" and "no patch" that an untrained network starts from."""
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """Sizes of the network; the defaults are SuperPoint's.
-
-    Attributes
-    ----------
-    widths : tuple of 4 int
-        Channels of the encoder's stages, at strides 1, 2, 4 and 8.
-    depths : tuple of 4 int
-        3x3 convolutions in each stage.
-    down : str
-        What halves the image after each of the first three stages: "max" (max-pooling) or "stride"
-        (the stage's last convolution has stride 2).
-    head_width, descriptor_width : int
-        Channels of the hidden layer of each head, and of the descriptor.
-    norm : str
-        BatchNorm "before" the activation (folds into the convolution at export) or "after" it (as in the
-        published SuperPoint weights, which need that).
-    ids : int
-        Number of patches that the ID head tells apart, besides "no patch".
-    """
-
-    widths: tuple[int, int, int, int] = (64, 64, 128, 128)
-    depths: tuple[int, int, int, int] = (2, 2, 2, 2)
-    down: str = "max"
-    head_width: int = 256
-    descriptor_width: int = 256
-    norm: str = "before"
-    ids: int = 4
-
-    def __post_init__(self) -> None:
-        if len(self.widths) != 4 or len(self.depths) != 4 or min(*self.widths, *self.depths) < 1:
-            raise DataError(f"network: widths {self.widths} and depths {self.depths}, expected four positive numbers each")
-        if self.down not in ("max", "stride") or self.norm not in ("before", "after"):
-            raise DataError(
-                f"network: down is {self.down!r} and norm {self.norm!r}, expected max or stride, and before or after"
-            )
 
 
 def block(c_in: int, c_out: int, kernel: int, norm: str, stride: int = 1, relu: bool = True) -> nn.Sequential:
@@ -123,9 +86,13 @@ class SuperPoint(nn.Module):
         with torch.no_grad():
             # the attached layer starts as "pass on what the detector head says"
             self.detector_attached.weight.copy_(torch.eye(pixels + 1)[:, :, None, None])
-            cast(Tensor, self.detector_attached.bias)[-1] = math.log(NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * pixels)
+            cast(Tensor, self.detector_attached.bias)[-1] = math.log(
+                NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * pixels
+            )
             self.descriptor_attached.weight.mul_(0.1)
-            cast(Tensor, self.descriptor_attached.bias)[-1] = math.log(NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * ids)
+            cast(Tensor, self.descriptor_attached.bias)[-1] = math.log(
+                NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * ids
+            )
 
     @property
     def attached(self) -> list[nn.Parameter]:
@@ -133,6 +100,7 @@ class SuperPoint(nn.Module):
         return [*self.detector_attached.parameters(), *self.descriptor_attached.parameters()]
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Raw heads, see the class."""
         features = self.backbone(image)
         return self.detector_attached(self.detector(features)), self.descriptor_attached(self.descriptor(features))
 
@@ -153,7 +121,8 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             return dict(load_file(path))
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, SafetensorError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise DataError(f"{path}: cannot be read as weights ({str(error).splitlines()[0]})") from None
+        why = (str(error) or type(error).__name__).splitlines()[0]
+        raise DataError(f"{path}: cannot be read as weights ({why})") from None
     if not isinstance(loaded, dict) or not all(isinstance(value, Tensor) for value in loaded.values()):
         raise DataError(f"{path}: holds no state-dict, expected names with tensors")
     return loaded
@@ -196,3 +165,91 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
     network.load_state_dict({name: weights[name] for name in given}, strict=False)
     fresh = sorted({name.split(".")[0] for name in own if name not in given and "num_batches" not in name})
     return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
+
+
+# Losses -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Targets:
+    """What is asked of each cell.
+
+    Attributes
+    ----------
+    place : Tensor of shape (B, 65, h, w): probabilities, sum 1.
+    asked : Tensor of shape (B, h, w): 0 where a keypoint is ignored, else 1.
+    identity : Tensor of shape (B, h, w), int64: patch, or ``ids`` for none.
+    near, far : Tensor of shape (B, h, w), bool: within 8 px of a keypoint; beyond 16 px of all.
+    """
+
+    place: Tensor
+    asked: Tensor
+    identity: Tensor
+    near: Tensor
+    far: Tensor
+
+
+def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: str) -> Targets:
+    """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.samples.Batch`) on images of that size."""
+    count, h, w = len(keypoints), height // CELL, width // CELL
+    xy, patch, ignore = keypoints[..., :2], keypoints[..., 2], keypoints[..., 3]
+    wanted = (patch >= 0) & (ignore == 0)
+
+    low = torch.floor(xy if place == "split" else xy + 0.5)
+    part = xy - low if place == "split" else torch.zeros_like(xy)
+    image = torch.zeros(count, height * width, device=keypoints.device)
+    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        x, y = (low[..., 0] + dx).long(), (low[..., 1] + dy).long()
+        share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
+        share = share * (wanted & (x >= 0) & (y >= 0) & (x < width) & (y < height))
+        image.scatter_add_(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1), share)
+    pixels = image.view(count, h, CELL, w, CELL).permute(0, 2, 4, 1, 3).reshape(count, CELL * CELL, h, w)
+    mass = pixels.sum(1, keepdim=True)
+    pixels = pixels / mass.clamp(min=1.0)
+    target = torch.cat([pixels, (1 - mass).clamp(min=0.0)], 1)
+
+    rows = torch.arange(h, device=keypoints.device) * CELL + (CELL - 1) / 2
+    columns = torch.arange(w, device=keypoints.device) * CELL + (CELL - 1) / 2
+    distance = torch.hypot(xy[:, :, 0, None, None] - columns, xy[:, :, 1, None, None] - rows[:, None])  # (B, K, h, w)
+    buried = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL / 2)).any(1)
+    asked = ~buried | (mass[:, 0] > 0)
+    nearest, which = distance.masked_fill(~wanted[..., None, None], float("inf")).min(1)
+    near = nearest <= CELL
+    identity = patch.long().gather(1, which.flatten(1)).view_as(which)
+    return Targets(target, asked.float(), torch.where(near, identity, ids), near, (nearest > 2 * CELL) & ~buried)
+
+
+def losses(detector: Tensor, ids: Tensor, targets: Targets, config: Loss) -> tuple[Tensor, Tensor]:
+    """(detector loss, identity loss) of raw head outputs (B, 65, h, w) and (B, ids + 1, h, w)."""
+    log_p = F.log_softmax(detector.float(), 1)
+    entropy = -(targets.place * log_p).sum(1)
+    mass = 1 - targets.place[:, -1]
+    weight = targets.asked * (1 + (config.positive_weight - 1) * mass)
+    if config.focal:
+        empty = log_p[:, -1].exp()
+        weight = weight * (mass * empty + (1 - mass) * (1 - empty)).detach() ** config.focal
+    located = (weight * entropy).sum() / targets.asked.sum().clamp(min=1.0)
+    hinge = _hinge if config.identity == "hinge" else _cross_entropy
+    return located, hinge(ids.float(), targets, config)
+
+
+def _cross_entropy(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+    entropy = F.cross_entropy(ids, targets.identity, reduction="none")
+    near, far = targets.near, targets.far
+    return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
+
+
+def _hinge(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+    """SuperPoint's descriptor loss (its eq. 4-6) of one image against the map of one-hot vectors.
+
+    The sum over pairs of cells is grouped by the class of the second cell: the dot product with a
+    one-hot vector is one channel of the normalised descriptor.
+    """
+    inside = targets.place[:, -1] < 1  # the class of a cell is the patch whose keypoint lies in it
+    identity = torch.where(inside, targets.identity, ids.shape[1] - 1)
+    dots = F.normalize(ids, dim=1).flatten(2)  # (B, C, cells)
+    onehot = F.one_hot(identity.flatten(1), ids.shape[1]).permute(0, 2, 1).float()
+    population = onehot.sum(2, keepdim=True)
+    positive = (onehot * F.relu(config.positive_margin - dots)).sum((1, 2)) * config.lambda_d
+    negative = ((1 - onehot) * population * F.relu(dots - config.negative_margin)).sum((1, 2))
+    return ((positive + negative) / dots.shape[2] ** 2).mean()

@@ -5,51 +5,52 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import multiprocessing
-import os
 import platform
 import shutil
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cache, cached_property
+from dataclasses import dataclass
+from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench import degrade, store
-from kpbench.background import Background, PhotoFolder, procedural
-from kpbench.design import Patch, shipped_patches
+from kpbench.background import PhotoFolder
+from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
-from kpbench.keypoints import UInt8
-from kpbench.scene import Limits, Rendered, measure_contrast, random_placements, render_scene
+from kpbench.keypoints import Detections, UInt8
+from kpbench.predictions import Predictions
+from kpbench.preview import draw_detections
+from kpbench.scene import stream
+from kpbench.sources import Source, image_writer
+from kpbench.workers import Progress, run_pieces
 
-__all__ = ["Progress", "Recipe", "SynthConfig", "generate", "make_sample"]
-
-Progress = Callable[[int], None]
-"""Called with the number of images that are finished since the last call."""
-
-BACKGROUND, SCENE, DETERIORATION = range(3)
+__all__ = ["Predicted", "Recipe", "degrade_files", "generate", "image_files", "predict", "predict_images"]
 
 
 class Recipe(Protocol):
-    """A dataset's definition: picklable, hashable, and all that its images are a function of.
-
-    ``n`` images in shards of ``shard_size``; ``image_bytes`` is what one is expected to take on disk.
-    """
+    """A dataset's definition: picklable, hashable, and all that its images are a function of."""
 
     @property
-    def n(self) -> int: ...
+    def n(self) -> int:
+        """Number of images."""
+        ...
+
     @property
-    def shard_size(self) -> int: ...
+    def shard_size(self) -> int:
+        """Images a shard."""
+        ...
+
     @property
-    def image_bytes(self) -> int: ...
+    def image_bytes(self) -> int:
+        """What one image is expected to take on disk."""
+        ...
+
     def to_dict(self) -> dict[str, Any]:
         """The config that is written into the dataset: no path of this machine."""
         ...
@@ -59,122 +60,6 @@ class Recipe(Protocol):
         ...
 
     def __hash__(self) -> int: ...
-
-
-@dataclass(frozen=True)
-class SynthConfig:
-    """All that a synthetic set is a function of, besides the background files.
-
-    Attributes
-    ----------
-    n : number of images.
-    seed : any whole number from 0.
-    size_px : (width, height).
-    channels : 1 (grey) or 3 (RGB).
-    deteriorate : "none" or "paper" (:func:`kpbench.degrade.paper_mix`); the scenes are the same.
-    shard_size : images a shard; changes the files but no image.
-    backgrounds : folder of photographs, or None for procedural ones.
-    limits : what a scene may hold.
-    patches : the designs to place.
-
-    Raises
-    ------
-    DataError
-        If a value is out of its range.
-    """
-
-    n: int
-    seed: int = 0
-    size_px: tuple[int, int] = (640, 480)
-    channels: int = 1
-    deteriorate: str = "paper"
-    shard_size: int = 500
-    backgrounds: Path | None = None
-    limits: Limits = field(default_factory=Limits)
-    patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
-
-    def __post_init__(self) -> None:
-        def need(good: bool, what: str) -> None:
-            if not good:
-                raise DataError(what)
-
-        need(1 <= self.n <= 10**9, f"--n is {self.n}, expected a number of images from 1 to 1,000,000,000")
-        need(self.seed >= 0, f"--seed is {self.seed}, expected a whole number from 0")
-        need(min(self.size_px) >= 64, f"--size is {self.size_px[0]}x{self.size_px[1]}, expected at least 64x64")
-        need(max(self.size_px) <= 16384, f"--size is {self.size_px[0]}x{self.size_px[1]}, at most 16384 a side")
-        need(self.channels in (1, 3), f"--channels is {self.channels}, expected 1 or 3")
-        need(self.deteriorate in ("none", "paper"), f"--deteriorate is {self.deteriorate!r}, expected none or paper")
-        need(self.shard_size >= 1, f"--shard-size is {self.shard_size}, expected a number of images from 1")
-
-    @cached_property
-    def photos(self) -> PhotoFolder | None:
-        """The listed background folder."""
-        return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
-
-    def to_dict(self) -> dict[str, Any]:
-        """What is written into the dataset: no path, so that a moved folder gives the same bytes."""
-        photos = self.photos
-        source = {"kind": "procedural"} if photos is None else {
-            "kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest,
-        }  # fmt: skip
-        return {
-            "kind": "synth",
-            "n": self.n,
-            "seed": self.seed,
-            "size_px": list(self.size_px),
-            "channels": self.channels,
-            "deteriorate": self.deteriorate,
-            "shard_size": self.shard_size,
-            "backgrounds": source,
-            "limits": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.limits).items()},
-            "patches": [patch.to_dict() for patch in self.patches],
-        }
-
-    @property
-    def image_bytes(self) -> int:
-        """Expected size on disk: photographs deflate to about two thirds, noise hardly at all."""
-        width, height = self.size_px
-        return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
-
-    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
-        """See :func:`make_sample`."""
-        return make_sample(self, index)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "photos"}
-
-
-def _stream(seed: int, index: int, stage: int) -> np.random.Generator:
-    """Random numbers of one stage of one image, independent of every other stage and image."""
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(index, stage))))
-
-
-def make_sample(config: SynthConfig, index: int) -> tuple[store.Sample, tuple[str, ...]]:
-    """Image ``index`` of a synthetic set, and the broken background files met on the way.
-
-    A function of (config, index, background files) and of nothing else.
-    """
-    width, height = config.size_px
-    background = _background(config, _stream(config.seed, index, BACKGROUND))
-    placements = random_placements(_stream(config.seed, index, SCENE), width, height, config.patches, config.limits)
-    scene = render_scene(background.image, placements)
-    image, effects = scene.image, list[dict[str, Any]]()
-    if config.deteriorate == "paper":
-        image, effects = _deteriorated(scene, _stream(config.seed, index, DETERIORATION))
-    return store.Sample(index, image, scene.keypoints, effects, background.file), background.broken
-
-
-def _background(config: SynthConfig, rng: np.random.Generator) -> Background:
-    width, height = config.size_px
-    if config.photos is None:
-        return Background(procedural(rng, width, height, config.channels))
-    return config.photos.sample(rng, width, height, config.channels)
-
-
-def _deteriorated(scene: Rendered, rng: np.random.Generator) -> tuple[UInt8, list[dict[str, Any]]]:
-    image, effects = degrade.paper_mix(scene.image, rng)
-    scene.keypoints["contrast"] = measure_contrast(image, scene.masks)
-    return image, effects
 
 
 @dataclass(frozen=True)
@@ -200,7 +85,7 @@ def generate(
     Parameters
     ----------
     config : Recipe
-        :class:`SynthConfig` or :class:`kpbench.suite.SuiteConfig`.
+        :class:`kpbench.synth.SynthConfig` or :class:`kpbench.suite.SuiteConfig`.
     out : folder; made if it is not there.
     workers : processes; None for one a core. 1 works in this process.
     resume : keep the finished shards of an interrupted run and make the rest.
@@ -226,8 +111,12 @@ def generate(
         _check_space(folder, config.image_bytes, sum(count for _, _, count in todo))
         progress(sum(done[name][0].count for name in done))
         results = dict(done)
-        for entry, broken in _run(config, written, folder, todo, workers, progress):
-            results[entry.file] = (entry, broken)
+        work = partial(_write_shard, config, written, folder)
+        try:
+            for entry, met in run_pieces(work, todo, workers, progress):
+                results[entry.file] = (entry, met)
+        except DataError as error:
+            raise DataError(f"{folder}: {error}; finished shards are kept, add --resume to go on") from None
         entries = [results[name][0] for name, _, _ in plan]
         broken = tuple(sorted({file for _, files in results.values() for file in files}))
         store.write_manifest(folder, written, entries, _provenance(broken))
@@ -316,6 +205,7 @@ def _provenance(broken: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: Piece, progress: Progress) -> Result:
+    config = _of_this_process(config)
     name, first, count = piece
     samples, met = [], set[str]()
     for index in range(first, first + count):
@@ -329,82 +219,180 @@ def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: P
     return store.ShardEntry(name, first, count, len(data), hashlib.sha256(data).hexdigest()), broken
 
 
-def _run(
-    config: Recipe,
-    written: dict[str, Any],
-    folder: Path,
-    todo: list[Piece],
-    workers: int | None,
-    progress: Progress,
-) -> Iterator[Result]:
-    workers = min(workers or cores(), len(todo))
-    if workers <= 1:
-        cv2.setNumThreads(1)
-        for piece in todo:
-            yield _write_shard(config, written, folder, piece, progress)
-        return
-    spawn = multiprocessing.get_context("spawn")  # a forked OpenCV or HDF5 may hang
-    counter = spawn.Value("q", 0)
-    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    try:
-        yield from _collect(pool, config, written, folder, todo, counter, progress)
-    except BrokenProcessPool:
-        raise DataError(
-            f"{folder}: a worker process died (out of memory?); finished shards are kept, add --resume to go on"
-        ) from None
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for process in multiprocessing.active_children():
-            process.terminate()
-
-
-def _collect(
-    pool: Executor,
-    config: Recipe,
-    written: dict[str, Any],
-    folder: Path,
-    todo: list[Piece],
-    counter: Any,
-    progress: Progress,
-) -> Iterator[Result]:
-    """Yield shards as they are finished, passing on the workers' image counter meanwhile."""
-    waiting: set[Future[Result]] = {pool.submit(_work, config, written, folder, piece) for piece in todo}
-    seen = 0
-    while waiting:
-        done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-        progress(counter.value - seen)
-        seen = counter.value
-        for future in done:
-            yield future.result()
-
-
-_counter: Any = None
-
-
-def _start_worker(counter: Any) -> None:
-    """Runs once in each worker: one thread, and Ctrl-C is the parent's business."""
-    global _counter
-    _counter = counter
-    cv2.setNumThreads(1)
-    with contextlib.suppress(ValueError):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _count(images: int) -> None:
-    with _counter.get_lock():
-        _counter.value += images
-
-
-def _work(config: Recipe, written: dict[str, Any], folder: Path, piece: Piece) -> Result:
-    return _write_shard(_of_this_process(config), written, folder, piece, _count)
-
-
 @cache
 def _of_this_process(config: Recipe) -> Recipe:
     """One config object a process, so that the decoded photographs are cached across shards."""
     return config
 
 
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+@dataclass(frozen=True)
+class Predicted:
+    """What a detector found, and (image, message) of every image that could not be read or on which it raised.
+
+    Such an image counts as no detections.
+    """
+
+    predictions: Predictions
+    failures: tuple[tuple[str, str], ...]
+
+
+Found = tuple[Detections, str]
+
+
+def predict(
+    dataset: store.Dataset,
+    detector: str | LoadedDetector,
+    *,
+    threshold: float | None = None,
+    workers: int | None = 1,
+    overlay: Path | None = None,
+    progress: Progress = lambda images: None,
+) -> Predicted:
+    """Run a detector over a dataset.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    detector : name or ``MODULE:ATTR`` (see :func:`kpbench.detect.load_detector`), or a loaded one, which
+        stays in this process.
+    threshold : drop detections of a lower score; None keeps all.
+    workers : processes, for a detector given by name; None for one a core.
+    overlay : folder or video to draw the detections into.
+    progress : called as images are finished.
+
+    Raises
+    ------
+    DataError
+        If the detector cannot be loaded, or the dataset cannot be read.
+    """
+    loaded = load_detector(detector) if isinstance(detector, str) else detector
+    if not isinstance(detector, str):
+        workers = 1
+    pieces = [range(first, min(first + 32, len(dataset))) for first in range(0, len(dataset), 32)]
+    work = partial(_detect_some, dataset, loaded if workers == 1 else detector, threshold)
+    found: dict[int, Found] = {}
+    for results in run_pieces(work, pieces, workers, progress):
+        found.update(results)
+    ids = dataset.truth.image_id
+    if overlay is not None:
+        with image_writer(overlay) as draw:
+            for n in range(len(dataset)):
+                draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
+    labels = [f"image_id {image_id}" for image_id in ids]
+    return _predicted(loaded, [found[n] for n in range(len(dataset))], labels, ids, str(dataset.path))
+
+
+def predict_images(
+    source: Source,
+    detector: str | LoadedDetector,
+    *,
+    threshold: float | None = None,
+    overlay: Path | None = None,
+    progress: Progress = lambda images: None,
+) -> Predicted:
+    """Run a detector over images that have no truth; ``image_id`` is their place in the source.
+
+    Parameters and errors are those of :func:`predict`; ``source`` is from :func:`kpbench.sources.open_images`.
+    """
+    loaded = load_detector(detector) if isinstance(detector, str) else detector
+    found, labels = list[Found](), list[str]()
+    with image_writer(overlay, source.fps) as draw, contextlib.suppress(KeyboardInterrupt):
+        # a camera never ends: Ctrl-C keeps what was found so far
+        for label, image in source.images:
+            found.append(
+                (Detections.none(), "cannot be decoded") if image is None else _detect(loaded, image, threshold)
+            )
+            labels.append(label)
+            if image is not None:
+                draw(label, draw_detections(image, found[-1][0]))
+            progress(1)
+    return _predicted(loaded, found, labels, np.arange(len(found)), None)
+
+
+def _predicted(
+    detector: LoadedDetector, found: list[Found], labels: list[str], ids: NDArray[np.int64], dataset: str | None
+) -> Predicted:
+    about = {"name": detector.name, "version": detector.version}
+    predictions = Predictions.from_detections([d for d, _ in found], ids, about, dataset)
+    return Predicted(predictions, tuple((label, said) for label, (_, said) in zip(labels, found, strict=True) if said))
+
+
+def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> Found:
+    try:
+        found = detector(image)
+    except Exception as error:  # whatever a detector of somebody else raises
+        return Detections.none(), f"{type(error).__name__}: {error}"
+    return (found if threshold is None else found[found.score >= threshold]), ""
+
+
+@cache
+def _loaded(name: str) -> LoadedDetector:
+    return load_detector(name)
+
+
+def _detect_some(
+    dataset: store.Dataset, detector: str | LoadedDetector, threshold: float | None, piece: range, progress: Progress
+) -> dict[int, Found]:
+    loaded = _loaded(detector) if isinstance(detector, str) else detector
+    results: dict[int, Found] = {}
+    for n in piece:
+        results[n] = _detect(loaded, dataset.image(n), threshold)
+        progress(1)
+    return results
+
+
+def image_files(source: Path) -> PhotoFolder:
+    """An image file or a folder of them.
+
+    Raises
+    ------
+    DataError
+        If it is not there, or no image in it can be decoded.
+    """
+    if source.is_dir():
+        return PhotoFolder.open(source)
+    photos = PhotoFolder(source.parent, (source.name,))
+    if photos.decode(source.name, 3) is None:
+        raise DataError(f"{source}: {'cannot be decoded as an image' if source.exists() else 'no such file or folder'}")
+    return photos
+
+
+def degrade_files(
+    photos: PhotoFolder, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
+) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
+    """Degrade images one by one and write them as PNG under their own names, with the folders they are in.
+
+    Parameters
+    ----------
+    photos : from :func:`image_files`; those that cannot be decoded are passed over.
+    out : folder; made if it is not there.
+    steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
+    seed : the n-th file is a function of its image, the steps, the seed and n.
+
+    Yields
+    ------
+    path : the file that was written.
+    effects : what was applied, see :func:`kpbench.degrade.climb`.
+
+    Raises
+    ------
+    DataError
+        If an effect is not known, a level is out of range, or a file cannot be written.
+    """
+    for n, name in enumerate(photos.files):
+        image = photos.decode(name, 3)
+        if image is None:
+            continue
+        if (image == image[..., :1]).all():  # grey, whatever the file's mode
+            image = np.ascontiguousarray(image[..., 0])
+        rng = stream(seed, n, 0)
+        effects = [degrade.climb(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
+        image = degrade.apply(image, rng, effects)
+        target = out / name if name.endswith(".png") else out / f"{name}.png"
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{target.parent}: cannot be made, {error.strerror}") from None
+        packed = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image)[1]
+        store.write_atomic(target, packed.tobytes())
+        yield target, effects

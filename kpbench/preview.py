@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.keypoints import UInt8
+from kpbench.keypoints import Detections, UInt8
 
-__all__ = ["contact_sheet", "draw_keypoints"]
+__all__ = ["contact_sheet", "draw_detections", "draw_keypoints"]
 
 # one colour an id, distinct to colour-blind eyes (Okabe and Ito 2008), RGB
 COLOURS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167))
@@ -44,6 +44,22 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
         text_at = (round(x + axes[0] + 2), round(y - 2))
         cv2.putText(canvas, str(k["patch_id"]), text_at, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
     return np.asarray(canvas, np.uint8)
+
+
+def draw_detections(image: UInt8, detections: Detections) -> UInt8:
+    """An RGB copy of an image with a cross, a ring and the ID on every detection."""
+    canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image.copy(), np.uint8)
+    for n, (x, y) in enumerate(detections.xy):
+        patch_id = None if detections.patch_id is None else int(detections.patch_id[n])
+        colour = (255, 0, 0) if patch_id is None else COLOURS[patch_id % len(COLOURS)]
+        at = (round(x * 16), round(y * 16))
+        cv2.circle(canvas, at, 9 * 16, colour, 1, cv2.LINE_AA, 4)
+        for dx, dy in ((4, 0), (0, 4)):
+            cv2.line(canvas, (round(x - dx), round(y - dy)), (round(x + dx), round(y + dy)), colour, 1)
+        if patch_id is not None:
+            text_at = (round(x + 10), round(y - 4))
+            cv2.putText(canvas, str(patch_id), text_at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return canvas
 
 
 def contact_sheet(tiles: Sequence[UInt8], columns: int, gap_px: int = 4) -> UInt8:

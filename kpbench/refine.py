@@ -34,13 +34,10 @@ Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 ANGLES = 24
-RINGS = (0.4, 0.7, 1.0)
-SOFT = 0.2
-"""Blur of the templates, in ring radii: what remains of a ring of 3.5 px after the pyramid's smoothing."""
 RING_PX = 3.0
-"""Short semi-axis of the outermost ring in px of its pyramid level; the smallest patch measures 5 px."""
+"""Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 _turn = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-RING_POINTS = np.concatenate([r * np.column_stack([np.cos(_turn), np.sin(_turn)]) for r in RINGS])
+_circle = np.column_stack([np.cos(_turn), np.sin(_turn)])
 
 
 @dataclass(frozen=True)
@@ -60,61 +57,79 @@ class Poses:
 
 
 @dataclass(frozen=True)
+class Templates:
+    """D designs sampled at M points on circles.
+
+    Attributes
+    ----------
+    points : (M, 2)
+    ink : (D, M) zero mean, unit norm.
+    solve : (D, 6, M) from a difference of templates to a step in (x, y, a11, a12, a21, a22).
+    sized : (D,) whether the pattern has a size of its own, which sectors have not.
+    """
+
+    points: Float
+    ink: Float32
+    solve: Float32
+    sized: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Bank:
-    """What the coarse stages need of a set of designs: the sectors around each centre.
+    """What the coarse stages need of a set of designs.
 
     Attributes
     ----------
     patches : the designs.
-    ink : (D, 72) template at :data:`RING_POINTS`, zero mean and unit norm.
-    solve : (D, 6, 72) from a difference of templates to a step in (x, y, a11, a12, a21, a22).
-    turned : (R, 72) all rotations of all templates, without those that look alike.
+    core : the innermost sectors, over the unit disc; they look the same at every size.
+    whole : the whole design, over the unit disc.
+    turned : (R, M) all rotations of all cores, without those that look alike.
     turned_which, turned_angle : (R,) the design and the rotation in radians of each.
     """
 
     patches: tuple[Patch, ...]
-    ink: Float32
-    solve: Float32
+    core: Templates
+    whole: Templates
     turned: Float32
     turned_which: Ints
     turned_angle: Float
 
 
 def bank(patches: Sequence[Patch]) -> Bank:
-    """Templates of the innermost sectors of each design."""
+    """Templates of some designs."""
     return _bank(tuple(patches))
 
 
 @lru_cache(maxsize=8)
 def _bank(patches: tuple[Patch, ...]) -> Bank:
-    templates, solvers, turned, which, angle = [], [], [], [], []
-    for n, patch in enumerate(patches):
-        ink, solve = _template(patch)
-        templates.append(ink)
-        solvers.append(solve)
-        rings = ink.reshape(len(RINGS), ANGLES)
-        seen: list[Float] = []
+    core = _templates(patches, (0.4, 0.7, 1.0), whole=False)
+    turned, which, angle = [], [], []
+    for n, ink in enumerate(core.ink):
+        seen: list[Float32] = []
         for k in range(ANGLES):
-            rolled = np.roll(rings, k, axis=1).ravel()
+            rolled = np.roll(ink.reshape(-1, ANGLES), k, axis=1).ravel()
             if all(rolled @ other < 0.99 for other in seen):
                 seen.append(rolled)
-                turned.append(rolled)
                 which.append(n)
                 angle.append(_turn[k])
-    pack = [np.array(a, np.float32) for a in (templates, solvers, turned)]
-    return Bank(patches, *pack, np.array(which, np.int64), np.array(angle))
+        turned += seen
+    whole = _templates(patches, (0.25, 0.45, 0.65, 0.85), whole=True)
+    return Bank(patches, core, whole, np.array(turned), np.array(which, np.int64), np.array(angle))
 
 
-def _template(patch: Patch) -> tuple[Float, Float]:
-    """Normalised template of one design's innermost sectors, and its Gauss-Newton solver."""
+def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
+    points = np.concatenate([r * _circle for r in rings])
+    pairs = [_template(_soft_ink(patch, whole), points) for patch in patches]
+    ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
+    return Templates(points, ink, solve, np.array([whole and len(p.cells[0]) > 2 for p in patches]))
 
-    def soft_ink(points: Float) -> Float:
-        return _look_up(_soft_sectors(patch), points)
 
+def _template(image: Float32, points: Float) -> tuple[Float, Float]:
+    """Normalised template and its Gauss-Newton solver."""
     step = 0.05
-    ink = soft_ink(RING_POINTS)
-    du, dv = ((soft_ink(RING_POINTS + s) - soft_ink(RING_POINTS - s)) / (2 * step) for s in np.eye(2) * step)
-    u, v = RING_POINTS.T
+    ink = _look_up(image, points)
+    du, dv = ((_look_up(image, points + s) - _look_up(image, points - s)) / (2 * step) for s in np.eye(2) * step)
+    u, v = points.T
     jacobian = np.column_stack([du, dv, du * u, du * v, dv * u, dv * v])
     ink = ink - ink.mean()
     jacobian /= np.linalg.norm(ink)
@@ -122,23 +137,28 @@ def _template(patch: Patch) -> tuple[Float, Float]:
     jacobian -= jacobian.mean(axis=0)  # grey offset and contrast are free
     jacobian -= np.outer(ink, ink @ jacobian)
     normal = jacobian.T @ jacobian
-    # scale, and stretch along two edges, leave sectors as they are: damping keeps them where they were
+    # stretch along two edges leaves sectors as they are: damping keeps it where it was
     return ink, np.linalg.solve(normal + np.eye(6) * 0.02 * np.trace(normal) / 6, jacobian.T)
 
 
 LOOKUP_HALF, LOOKUP_SIZE = 1.7, 273
+SOFT_CORE, SOFT_WHOLE = 0.2, 0.12
+"""Blur of the templates, in radii of the circle: what remains after the pyramid's smoothing."""
 
 
 @lru_cache(maxsize=64)
-def _soft_sectors(patch: Patch) -> Float32:
-    """Innermost sectors, white 1 and black -1, blurred by :data:`SOFT`, over [-1.7, 1.7]² ring radii."""
-    _, angles, black = patch.cells
+def _soft_ink(patch: Patch, whole: bool) -> Float32:
+    """Ink, white 1 and black -1, over [-1.7, 1.7]²: the design, or its innermost sectors without end; blurred."""
     fine = 3
     ticks = ((np.arange(LOOKUP_SIZE * fine) + 0.5) / (LOOKUP_SIZE * fine) * 2 - 1) * LOOKUP_HALF
-    u, v = np.meshgrid(ticks, ticks)
-    sector = (np.searchsorted(angles, np.degrees(np.arctan2(v, u)) % 360.0, side="right") - 1) % len(angles)
-    ink = np.where(black[0][sector], -1.0, 1.0).reshape(LOOKUP_SIZE, fine, LOOKUP_SIZE, fine).mean(axis=(1, 3))
-    return np.asarray(cv2.GaussianBlur(ink.astype(np.float32), (0, 0), SOFT * LOOKUP_SIZE / (2 * LOOKUP_HALF)))
+    points = np.stack(np.meshgrid(ticks, ticks), axis=-1)
+    # a point at radius r is seen at min(r, 0.999) of the design, or always near the centre
+    reach = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
+    end = np.minimum(reach, 0.999) if whole else 0.5 * patch.cells[0][1]
+    black = patch.is_black(points * (end / reach)[..., None])
+    ink = np.where(black, -1.0, 1.0).reshape(LOOKUP_SIZE, fine, LOOKUP_SIZE, fine).mean(axis=(1, 3))
+    blur = (SOFT_WHOLE if whole else SOFT_CORE) * LOOKUP_SIZE / (2 * LOOKUP_HALF)
+    return np.asarray(cv2.GaussianBlur(ink.astype(np.float32), (0, 0), blur))
 
 
 def _look_up(image: Float32, points: Float) -> Float:
@@ -170,10 +190,14 @@ def _sample(levels: Sequence[Float32], level: Ints, points: Float) -> Float32:
     return values
 
 
-def _normalise(values: Float32, floor: float = 2.0) -> Float32:
-    """Zero mean and unit norm a row; a standard deviation under ``floor`` grey levels counts as nothing."""
+FLOOR = 1.0
+"""Grey levels; a standard deviation around a place that is under it counts as nothing."""
+
+
+def _normalise(values: Float32) -> Float32:
+    """Zero mean and unit norm a row."""
     centred = values - values.mean(axis=1, keepdims=True)
-    size = np.einsum("nm,nm->n", centred, centred) + np.float32(floor**2 * values.shape[1])
+    size = np.einsum("nm,nm->n", centred, centred) + np.float32(FLOOR**2 * values.shape[1])
     return centred / np.sqrt(size)[:, None]
 
 
@@ -219,7 +243,7 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
     tilt, turn = np.zeros((2, len(xy), designs), np.int64)
     starts = np.searchsorted(known.turned_which, np.arange(designs + 1))
     for k, map_ in enumerate(tilts):
-        points = xy[:, None] + scale[:, None, None] * (RING_POINTS @ map_.T)
+        points = xy[:, None] + scale[:, None, None] * (known.core.points @ map_.T)
         ncc = _normalise(_sample(levels, level, points)) @ known.turned.T
         for d in range(designs):
             part = ncc[:, starts[d] : starts[d + 1]]
@@ -234,16 +258,16 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
     return Poses(xy[place], A, which, best[place, which].astype(np.float64))
 
 
-def align(levels: Sequence[Float32], poses: Poses, known: Bank, steps: int, ring_px: float = 2.8) -> Poses:
-    """Move ring poses onto the image.
+def align(levels: Sequence[Float32], poses: Poses, templates: Templates, steps: int, radius_px: float) -> Poses:
+    """Move poses onto the image.
 
     Parameters
     ----------
     levels : from :func:`pyramid`.
-    poses : ``A`` maps the unit circle to the outermost ring, which must lie inside the patch.
-    known : the designs.
+    poses : ``A`` maps the templates' unit circle to the image.
+    templates : ``Bank.core`` or ``Bank.whole``.
     steps : Gauss-Newton steps.
-    ring_px : the ring's short semi-axis, in px of the level that is looked at, is at least this.
+    radius_px : the circle's short semi-axis, in px of the level that is looked at, is at least this.
 
     Returns
     -------
@@ -251,22 +275,54 @@ def align(levels: Sequence[Float32], poses: Poses, known: Bank, steps: int, ring
         With the correlation after the last step.
     """
     xy, A, which = poses.xy, poses.A, poses.which
-    ink, solve = known.ink[which], known.solve[which]
+    ink, solve, sized = templates.ink[which], templates.solve[which], templates.sized[which]
     for step in range(steps + 1):
-        level = np.clip(np.floor(np.log2(np.maximum(short_axis(A), 1e-6) / ring_px)), 0, len(levels) - 1)
-        points = xy[:, None] + RING_POINTS @ np.swapaxes(A, 1, 2)
-        values = _normalise(_sample(levels, level.astype(np.int64), points))
-        ncc = np.einsum("nm,nm->n", values, ink)
+        points = xy[:, None] + templates.points @ np.swapaxes(A, 1, 2)
+        values = _sample(levels, _level(short_axis(A), radius_px, levels), points)
+        ncc, residual = _compare(values, ink, _outside(points, levels[0]))
         if step == steps:
             break
-        residual = values / np.maximum(ncc, 0.3)[:, None] - ink
-        delta = np.einsum("nkm,nm->nk", solve, residual).astype(np.float64)
+        delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
         delta *= np.minimum(1.0, 0.35 / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
         turn = np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
-        # sectors have no size: what is left of it in the templates is their blur, which is no guide
-        A = A @ turn / np.sqrt(np.abs(np.linalg.det(turn)))[:, None, None]
+        # sectors have no size: what the templates show of one is their blur, which is no guide
+        turn /= np.where(sized, 1.0, np.sqrt(np.abs(np.linalg.det(turn))))[:, None, None]
+        A = A @ turn
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])
     return Poses(xy, A, which, ncc.astype(np.float64))
+
+
+def _compare(values: Float32, ink: Float32, outside: NDArray[np.bool_]) -> tuple[Float32, Float32]:
+    """Correlation of grey values with templates (N,), and the residuals in the templates' unit (N, M).
+
+    Samples outside the image are left out of the one and are zero in the other.
+    """
+    scaled = _normalise(values)
+    ncc = np.einsum("nm,nm->n", scaled, ink)
+    residual = scaled / np.maximum(ncc, 0.3)[:, None] - ink
+    cut = np.flatnonzero(outside.any(axis=1))
+    if len(cut):
+        inside = ~outside[cut]
+        share = np.maximum(inside.sum(axis=1, keepdims=True), 1)
+        grey, model = (np.where(inside, a - (a * inside).sum(1, keepdims=True) / share, 0) for a in (values[cut], ink[cut]))
+        size = np.einsum("nm,nm->n", model, model)
+        slope = np.einsum("nm,nm->n", grey, model) / np.maximum(size, 1e-6)
+        spread = np.einsum("nm,nm->n", grey, grey) + FLOOR**2 * share[:, 0]
+        # a patch of which less than half is in the image proves little
+        ncc[cut] = slope * np.sqrt(size / spread) * np.minimum(1, 2 * share[:, 0] / inside.shape[1])
+        residual[cut] = np.where(inside, grey / np.maximum(slope, 0.3 * np.sqrt(spread))[:, None] - model, 0)
+    return ncc, residual
+
+
+def _outside(points: Float, image: Float32) -> NDArray[np.bool_]:
+    height, width = image.shape
+    return np.asarray(np.any((points < 0) | (points > (width - 1, height - 1)), axis=-1))
+
+
+def _level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Ints:
+    """The coarsest pyramid level in which a radius still measures ``least_px``."""
+    octave = np.floor(np.log2(np.maximum(radius_px, 1e-6) / least_px))
+    return np.clip(octave, 0, len(levels) - 1).astype(np.int64)
 
 
 BOUND = 0.7
@@ -295,12 +351,13 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
         index = np.log(reach / FIRST) / np.log(GROWTH)
         index = np.rint(index[:, None] + np.arange(STEPS)[:, None]).astype(np.int64)  # (G, sizes, spokes)
         index = np.clip(index, 0, STEPS - 1)
-        total, ring = np.zeros((2, len(rows), *index.shape[:2]))
+        total, good, bad = np.zeros((3, len(rows), *index.shape[:2]))
         for s in range(SPOKES):
             total += summed[rows, s][:, index[..., s]]
-            ring += (votes[rows, s] > 0)[:, index[..., s]]
+            good += (votes[rows, s] > 0)[:, index[..., s]]
+            bad += (votes[rows, s] < 0)[:, index[..., s]]
         # beyond the first ring that disagrees, what agrees is chance
-        total[np.logical_or.accumulate(ring < BOUND * SPOKES, axis=2)] = -np.inf
+        total[np.logical_or.accumulate((bad > (1 - BOUND) * (good + bad)) | (good < 0.3 * SPOKES), axis=2)] = -np.inf
         total[:, :, 0] = np.maximum(total[:, :, 0], -1e9)
         best = total.reshape(len(rows), -1).argmax(axis=1)
         shape, size = np.unravel_index(best, total.shape[1:])
@@ -310,24 +367,22 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
 
 def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, spokes: Float, radii: Float) -> Float:
     """Agreement in [-1.4, 0.6] of each spoke's pixels with the predicted ink, (N, spokes, radii)."""
-    predicted = np.stack([_look_up(_soft_sectors(p), spokes) for p in known.patches])[poses.which]
+    predicted = np.stack([_look_up(_soft_ink(p, False), spokes) for p in known.patches])[poses.which]
     axis = short_axis(poses.A)
     values = np.empty((len(poses), len(spokes), len(radii)), np.float32)
     directions = spokes @ np.swapaxes(poses.A, 1, 2)
-    height, width = levels[0].shape
     outside = np.zeros(values.shape, bool)
     for k, radius in enumerate(radii):
-        level = np.clip(np.floor(np.log2(np.maximum(axis * radius, 1e-6) / RING_PX)), 0, len(levels) - 1)
         points = poses.xy[:, None] + radius * directions
-        values[..., k] = _sample(levels, level.astype(np.int64), points)
-        outside[..., k] = np.any((points < 0) | (points > (width - 1, height - 1)), axis=2)
+        values[..., k] = _sample(levels, _level(axis * radius, RING_PX, levels), points)
+        outside[..., k] = _outside(points, levels[0])
     inner = values[..., radii <= 1.0]
     sign = np.where(predicted > 0, 1.0, 0.0)[..., None]
     white = (inner * sign).sum(axis=(1, 2)) / np.maximum((sign * np.ones_like(inner)).sum(axis=(1, 2)), 1)
     black = (inner * (1 - sign)).sum(axis=(1, 2)) / np.maximum(((1 - sign) * np.ones_like(inner)).sum(axis=(1, 2)), 1)
     half = np.maximum((white - black) / 2, 1.0)[:, None, None]
     agree = np.clip((values - ((white + black) / 2)[:, None, None]) / half * np.sign(predicted)[..., None], -1, 1)
-    return np.where(outside, -0.2, (agree - 0.4) * np.abs(predicted)[..., None])
+    return np.where(outside, 0.0, (agree - 0.4) * np.abs(predicted)[..., None])
 
 
 @lru_cache(maxsize=64)
@@ -383,7 +438,7 @@ def fit(
     size = np.linalg.norm(A, 2, axis=(1, 2)) * [p.extent for p in patches] if len(patches) else np.zeros(0)
     level = np.clip(np.ceil(np.log2(np.maximum(size, 1e-6) / largest_px)), 0, len(levels) - 1).astype(int)
     scale = 2.0**level
-    states = [_State(xy[n] / s, A[n] / s, A[n] / s, 0.7) for n, s in enumerate(scale)]
+    states = [_State(xy[n] / s, A[n] / s, A[n] / s, np.zeros(2), 0.7) for n, s in enumerate(scale)]
     for step in range(steps + 1):
         boxes = [_box(state, patch.extent) for state, patch in zip(states, patches, strict=True)]
         covers = coverage([_outline(s, p) for s, p in zip(states, patches, strict=True)], boxes)
@@ -401,6 +456,7 @@ class _State:
     xy: Float
     A: Float
     window: Float
+    bend: Float
     blur: float
     black: float = 0.0
     white: float = 0.0
@@ -414,13 +470,15 @@ BEYOND = 1.3
 
 def _box(state: _State, extent: float) -> tuple[int, int, int, int]:
     reach = np.sqrt((state.A**2).sum(axis=1)) * extent * BEYOND * 1.02
+    reach /= 1 - extent * BEYOND * np.hypot(*state.bend)
     low, high = np.floor(state.xy - reach).astype(int) - 1, np.ceil(state.xy + reach).astype(int) + 2
     return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
 
 
 def _outline(state: _State, patch: Patch) -> list[Float]:
     radius = max(float(np.abs(state.A).max()), 1.0)
-    return [state.xy + p @ state.A.T for p in _black_cells(patch, 2.0 ** np.floor(np.log2(0.02 / radius)))]
+    cells = _black_cells(patch, 2.0 ** np.floor(np.log2(0.02 / radius)))
+    return [state.xy + p @ state.A.T / (1 + p @ state.bend)[:, None] for p in cells]
 
 
 @lru_cache(maxsize=256)
@@ -470,20 +528,32 @@ def _step(state: _State, image: Float32, box: tuple[int, int, int, int], cover: 
     gx, gy = gx[inside], gy[inside]
     (a, b), (c, d) = np.linalg.inv(state.A)
     u, v = (a * dx + b * dy)[inside], (c * dx + d * dy)[inside]
+    stretch = 1 / np.maximum(1 - state.bend[0] * u - state.bend[1] * v, 0.3)  # 1 + bend·u of the true patch point
+    u, v = u * stretch, v * stretch
+    away = gx * (state.A[0, 0] * u + state.A[0, 1] * v) + gy * (state.A[1, 0] * u + state.A[1, 1] * v)
     ones = np.ones_like(m)
-    moves = np.stack([ones, m, *(-slope * g for g in (gx, gy, gx * u, gx * v, gy * u, gy * v)), laplace * (slope / 2)])
+    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, away * u, away * v)
+    moves = np.stack([ones, m, *(slope * g for g in shifts), laplace * (slope / 2)])
     # pixels that the model cannot explain (shadow edges, rain, what hides the patch) pull less
     usual = 2.5 * 1.48 * float(np.median(np.abs(residual))) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(np.abs(residual), 1e-6))
     normal = weighted @ moves.T
-    normal[DIAGONAL] += 1e-3 * normal[DIAGONAL] + 1e-6
-    delta = np.linalg.solve(normal, weighted @ residual)
+    target = weighted @ residual
+    diagonal = np.arange(4, 11)
+    # affine map and blur are damped, as sectors alone leave size and some stretches open
+    normal[diagonal, diagonal] += 1e-3 * normal[diagonal, diagonal] + 1e-3
+    normal[[2, 3], [2, 3]] += 1e-6 * normal[0, 0]
+    prior = (noise**2 + 1) / (BEND * minor) ** 2
+    normal[[8, 9], [8, 9]] += prior
+    target[8:10] -= prior * state.bend
+    delta = np.linalg.solve(normal, target)
     shift, grow = delta[2:4], delta[4:8].reshape(2, 2)
     shift = shift * min(1.0, 0.3 * minor / max(float(np.hypot(*shift)), 1e-9))
     grow = grow * min(1.0, 0.2 * minor / max(float(np.abs(grow).max()), 1e-9))
-    blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[8], -1, 1), 0.04, (0.5 * minor) ** 2)))
-    return replace(state, xy=state.xy + shift, A=state.A + grow, blur=blur)
+    blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[10], -1, 1), 0.04, (0.5 * minor) ** 2)))
+    bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
+    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur)
 
 
-DIAGONAL = (np.arange(4, 9), np.arange(4, 9))
-"""Affine map and blur are damped, as sectors alone leave size and some stretches open."""
+BEND = 1 / 400
+"""Expected change of distance over a patch, in distances a px of its radius: tilt over focal length."""

@@ -39,7 +39,7 @@ MOST_KEYPOINTS = 12
 VALIDATION_EVERY = 10
 IMAGE_WIDTH_PX = 640  # the image that a crop is thought to be cut from: focal lengths are relative to it
 DETECTABLE = 12.0
-"""Least contrast / noise · √area of a keypoint that is asked for: 6 σ at the output of a matched filter."""
+"""Least contrast / noise · √area of a keypoint that is asked for: 6 sigma at the output of a matched filter."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ def _scenes(
     keypoints = _no_keypoints(count)
     for n in range(count):
         fixed = np.random.default_rng([seed, 1, (first + n) % config.set_size])
-        background = _window(photos[fixed.integers(len(photos))], fixed, width, height)
+        background = _window(photos[int(fixed.integers(len(photos)))], fixed, width, height)
         rendered = render_scene(background, random_placements(fixed, width, height, patches, Limits()))
         image = degrade.paper_mix(rendered.image, rng)[0] if rng.random() < severity else rendered.image
         images[n] = image
@@ -260,6 +260,7 @@ def _crops(
         canvases.append(image)
     _paint_all(canvases, discs)
     for n in range(count):
+        hidden = _occlude(canvases[n], rng, discs[n]) if rng.random() < 0.08 * severity else ()
         radius = min((d.minor for d in discs[n]), default=20.0)
         image, gain, kernel, sigma = _degrade(canvases[n], rng, severity, radius)
         images[n] = image
@@ -267,7 +268,11 @@ def _crops(
         for k, disc in enumerate(inside[:MOST_KEYPOINTS]):
             kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
             signal = gain * (disc.white - disc.black) * max(kept, 0.0) * np.sqrt(np.pi * disc.major * disc.minor)
-            lost = signal < DETECTABLE * sigma or disc.minor < 0.5 * Limits().minor_axis_px
+            lost = (
+                signal < DETECTABLE * sigma
+                or disc.minor < 0.5 * Limits().minor_axis_px
+                or any(disc is h for h in hidden)
+            )
             keypoints[n, k] = disc.x, disc.y, disc.place, disc.major if lost else 0.0
     return Batch(images, keypoints)
 
@@ -288,7 +293,7 @@ def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, h
     """Mostly photographs, of any contrast and brightness; now and then an even surface."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
-    image = _window(photos[rng.integers(len(photos))], rng, width, height, least=0.1)
+    image = _window(photos[int(rng.integers(len(photos)))], rng, width, height, least=0.1)
     if rng.random() < 0.5:
         middle = rng.uniform(60, 200)
         table = np.clip(middle + rng.uniform(0.4, 1.6) * (np.arange(256) - 127.0), 0, 255).astype(np.uint8)
@@ -308,10 +313,10 @@ def random_poses(rng: np.random.Generator, count: int, limits: Limits) -> Float:
     missing = count
     while missing > 0:
         n = 2 * missing + 8
-        focal = IMAGE_WIDTH_PX * np.exp(rng.uniform(*np.log(limits.focal), n))
+        focal = IMAGE_WIDTH_PX * np.exp(rng.uniform(*_log(limits.focal), n))
         (cx, cy), (sx, sy) = np.cos(a := np.radians(rng.uniform(-1, 1, (2, n)) * limits.tilt_deg)), np.sin(a)
         cz, sz = np.cos(b := rng.uniform(0, 2 * np.pi, n)), np.sin(b)
-        radius = np.exp(rng.uniform(*np.log(limits.radius_px), n))
+        radius = np.exp(rng.uniform(*_log(limits.radius_px), n))
         x, y = rng.uniform(-0.5, 0.5, n) * IMAGE_WIDTH_PX, rng.uniform(-0.375, 0.375, n) * IMAGE_WIDTH_PX
         H = np.empty((n, 3, 3))
         # columns of Rx @ Ry @ Rz (geometry.rotation_xyz), times K with its principal point at (0, 0)
@@ -326,6 +331,10 @@ def random_poses(rng: np.random.Generator, count: int, limits: Limits) -> Float:
         found.append(H[good][:missing])
         missing -= len(found[-1])
     return np.concatenate(found) if found else np.zeros((0, 3, 3))
+
+
+def _log(interval: tuple[float, float]) -> tuple[float, float]:
+    return float(np.log(interval[0])), float(np.log(interval[1]))
 
 
 def ellipses(H: Float) -> tuple[Float, Float, Float]:
@@ -359,12 +368,19 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -
         # a hexagon of circumradius 0.36 S for patches of diameter 0.16 S; other boards are tighter or looser
         ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
         corners = turn + np.arange(6) * np.pi / 3
-        offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array([np.cos(turn), np.sin(turn)])
+        offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array(
+            [np.cos(turn), np.sin(turn)]
+        )
         steps = np.tile(np.eye(3), (6, 1, 1))
         steps[:, :2, 2] = offsets
         turns = np.zeros((6, 3, 3))
         spin = rng.uniform(0, 2 * np.pi, 6) if rng.random() < 0.5 else np.zeros(6)
-        turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1] = np.cos(spin), -np.sin(spin), np.sin(spin), np.cos(spin)
+        turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1] = (
+            np.cos(spin),
+            -np.sin(spin),
+            np.sin(spin),
+            np.cos(spin),
+        )
         turns[:, 2, 2] = 1.0
         poses = first @ steps @ turns
         poses = poses[poses[:, 2, 2] > 0.2]
@@ -441,7 +457,23 @@ def _distract(image: UInt8, rng: np.random.Generator) -> None:
         else:  # a bar or a line
             c, s = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
             thick = int(rng.integers(1, 8))
-            cv2.line(image, (int(x - 3 * c), int(y - 3 * s)), (int(x + 3 * c), int(y + 3 * s)), dark, thick, cv2.LINE_AA)
+            cv2.line(
+                image, (int(x - 3 * c), int(y - 3 * s)), (int(x + 3 * c), int(y + 3 * s)), dark, thick, cv2.LINE_AA
+            )
+
+
+def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc]) -> list[Disc]:
+    """Put things over the patches; returns those of which more than a third is hidden."""
+    before = image.copy()
+    _distract(image, rng)
+    changed = (image != before).astype(np.float32)
+    hidden = []
+    for disc in discs:
+        place = np.zeros_like(before)
+        cv2.circle(place, (round(disc.x), round(disc.y)), max(2, round((disc.major + disc.minor) / 2)), 1, -1)
+        if (changed * place).sum() > place.sum(dtype=np.float32) / 3:
+            hidden.append(disc)
+    return hidden
 
 
 def _chequers(image: UInt8, rng: np.random.Generator, dark: float, light: float) -> None:
@@ -450,7 +482,9 @@ def _chequers(image: UInt8, rng: np.random.Generator, dark: float, light: float)
     board = np.kron(np.indices((rows, columns)).sum(axis=0) % 2, np.ones((side, side)))
     texture = np.where(board > 0, dark, light).astype(np.uint8)
     angle = rng.uniform(0, 2 * np.pi)
-    A = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag([1.0, rng.uniform(0.5, 1.0)])
+    A = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag(
+        [1.0, rng.uniform(0.5, 1.0)]
+    )
     shift = rng.uniform(0, 1, 2) * image.shape[::-1] - A @ (np.array(texture.shape[::-1]) / 2)
     M = np.column_stack([A, shift])
     size = (image.shape[1], image.shape[0])
@@ -507,6 +541,10 @@ def _degrade(
     if rng.random() < 0.3 * severity:
         work, factor = _shade(work, rng)
         gain *= factor
+    if rng.random() < 0.08 * severity:
+        work = 0.7 * _rain(work, rng)
+        gain *= 0.7
+        sigma += 4.0
     if rng.random() < 0.6 * severity + 0.2:
         work, kernel = _soften(work, rng, severity, radius)
     draw = rng.random()
@@ -540,14 +578,33 @@ def _degrade(
 
 
 def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """A shadow with one straight border, sharp or soft, or a slope of light across the image."""
+    """A shadow with one straight border, sharp or soft; now and then a glare instead."""
     height, width = work.shape
+    if rng.random() < 0.15:
+        x = (np.arange(width, dtype=np.float32) - np.float32(rng.uniform(0, width))) / np.float32(rng.uniform(8, width))
+        y = (np.arange(height, dtype=np.float32) - np.float32(rng.uniform(0, height))) / np.float32(
+            rng.uniform(8, height)
+        )
+        glare = np.float32(rng.uniform(40, 200)) * np.exp(-(x**2 + y[:, None] ** 2))
+        return np.asarray(work + glare, np.float32), 0.5
     angle = rng.uniform(0, 2 * np.pi)
     x = (np.arange(width, dtype=np.float32) - np.float32(rng.uniform(0, width))) * np.float32(np.cos(angle))
     y = (np.arange(height, dtype=np.float32) - np.float32(rng.uniform(0, height))) * np.float32(np.sin(angle))
     ramp = np.clip((y[:, None] + x) / np.float32(np.exp(rng.uniform(0, np.log(width)))) + 0.5, 0, 1)
     factor = rng.uniform(0.2, 0.9)
-    return work * (1 - np.float32(1 - factor) * ramp), factor
+    return np.asarray(work * (1 - np.float32(1 - factor) * ramp), np.float32), factor
+
+
+def _rain(work: Float32, rng: np.random.Generator) -> Float32:
+    """Short bright streaks of one slant, a little out of focus."""
+    height, width = work.shape
+    count = rng.integers(10, 60)
+    start = rng.uniform(-10, 1, (count, 2)) + rng.uniform(0, 1, (count, 2)) * (width + 10, height + 10)
+    step = np.array([rng.uniform(-8, 8), rng.uniform(8, 20)])
+    lines = np.rint(np.stack([start, start + step], axis=1)).astype(np.int32)
+    streaked = cv2.polylines(work, list(lines), False, rng.uniform(160, 230))
+    reach = int(rng.choice([1, 3, 5, 7]))
+    return np.asarray(cv2.blur(streaked, (reach, reach), borderType=degrade.BORDER), np.float32)
 
 
 def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
@@ -555,14 +612,14 @@ def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: fl
     widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
     width = float(rng.uniform(1.0, max(widest, 1.5)))
     kind = rng.integers(4)
-    if kind == 0:
-        taps = degrade.box_taps(width)
-        return cv2.sepFilter2D(work, -1, taps, taps, borderType=degrade.BORDER), width  # type: ignore[return-value]
     if kind == 1:  # a Gaussian of the box's standard deviation
-        return cv2.GaussianBlur(work, (0, 0), width / np.sqrt(12)), width  # type: ignore[return-value]
+        return np.asarray(cv2.GaussianBlur(work, (0, 0), width / np.sqrt(12)), np.float32), width
     if kind == 2:
-        line = degrade.line_kernel(round(1.5 * width), float(rng.integers(0, 180)))
-        return cv2.filter2D(work, -1, line, borderType=degrade.BORDER), width  # type: ignore[return-value]
-    side = np.arange(-int(width / 2 + 1), int(width / 2 + 1) + 1)
-    disc = np.clip(width / 2 + 0.5 - np.hypot(side, side[:, None]), 0, 1)
-    return cv2.filter2D(work, -1, disc / disc.sum(), borderType=degrade.BORDER), width  # type: ignore[return-value]
+        kernel = degrade.line_kernel(round(1.5 * width), float(rng.integers(0, 180)))
+    elif kind == 3:  # defocus
+        side = np.arange(-int(width / 2 + 1), int(width / 2 + 1) + 1)
+        disc = np.clip(width / 2 + 0.5 - np.hypot(side, side[:, None]), 0, 1)
+        kernel = disc / disc.sum()
+    else:
+        kernel = np.outer(taps := degrade.box_taps(width), taps)
+    return np.asarray(cv2.filter2D(work, -1, kernel, borderType=degrade.BORDER), np.float32), width

@@ -14,7 +14,7 @@ from kpbench.geometry import Camera, Ellipse, plane_to_camera, project, projecte
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
 from kpbench.raster import Box, box_around, coverage
 
-__all__ = ["Limits", "Placement", "Rendered", "measure_contrast", "random_placements", "render_scene"]
+__all__ = ["Limits", "Placement", "Rendered", "measure_contrast", "random_placements", "render_scene", "stream"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,11 @@ class Rendered:
     masks: tuple[Mask, ...]
 
 
+def stream(seed: int, index: int, stage: int) -> np.random.Generator:
+    """Random numbers of one stage of one image, independent of every other stage and image."""
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(index, stage))))
+
+
 def random_placements(
     rng: np.random.Generator, width_px: int, height_px: int, patches: Sequence[Patch], limits: Limits
 ) -> list[Placement]:
@@ -103,6 +108,8 @@ def _random_pose(rng: np.random.Generator, width_px: int, height_px: int, limits
         x, y = rng.uniform(0, width_px - 1), rng.uniform(0, height_px - 1)
         t = depth * np.array([(x - K[0, 2]) / focal_px, (y - K[1, 2]) / focal_px, 1.0])
         H = K @ plane_to_camera(R, t) / depth
+        if np.hypot(H[2, 0], H[2, 1]) > 0.5:  # so near, as in tiny images, that its depth varies by half or more
+            continue
         ellipse = projected_disc(H)
         if 2 * ellipse.minor >= limits.minor_axis_px and _axis_difference(ellipse) <= limits.axis_difference:
             return np.asarray(H)

@@ -366,7 +366,7 @@ class Scores:
         the condition and rung, and for each over all images.
     confusion : dict
         ``ids`` (true ones, sorted) and ``matrix``: a row a true id, a column a detected id of a matched
-        detection, and a last column for ids that no true keypoint has. Empty without identities.
+        detection, and a last column for ids that no true keypoint has or that are contradicted. Empty without identities.
     curve : dict
         ``score``, ``precision``, ``recall`` and ``average_false_alarm`` when only detections of at least that
         score are kept, from the surest on; at most 201 points.
@@ -640,15 +640,16 @@ def _whole(rung: float) -> float | None:
     return int(rung) if float(rung).is_integer() else float(rung)
 
 
-def _confusion(truth_id: Int, detection: Int, patch_id: Int | None) -> dict[str, Any]:
+def _confusion(truth_id: Int, found: Matches, patch_id: Int | None) -> dict[str, Any]:
     if patch_id is None:
         return {}
-    found = detection >= 0
+    matched = found.detection >= 0
     ids, row = np.unique(truth_id, return_inverse=True)
-    detected = patch_id[detection[found]]
+    detected = patch_id[found.detection[matched]]
     column = np.searchsorted(ids, detected)
     known = np.append(ids, -1)[column] == detected
-    cell = row[found] * (len(ids) + 1) + np.where(known, column, len(ids))
+    known &= ~found.contradicted[matched]
+    cell = row[matched] * (len(ids) + 1) + np.where(known, column, len(ids))
     matrix = np.bincount(cell, minlength=len(ids) * (len(ids) + 1)).reshape(len(ids), len(ids) + 1)
     return {"ids": ids.tolist(), "matrix": matrix.tolist()}
 
@@ -775,7 +776,7 @@ def evaluate(
     return Scores(
         overall=overall,
         by=tuple(by),
-        confusion=_confusion(truth_id, found.detection, ids),
+        confusion=_confusion(truth_id, found, ids),
         curve=_curve_table(rows, len(truth)),
         settings=settings,
         detector=predictions.detector,

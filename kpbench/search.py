@@ -266,7 +266,7 @@ def search(
     progress()
     measures += [basin(FAMILY_GRID, inks), disc_bound(FAMILY_GRID, inks, SIZES_PX[0])[0]]
     pixels, bound_to_centre, bounds = measures
-    medians = [float(np.median(m)) for m in (bounds, bound_to_centre, pixels)]
+    median_bound, median_basin, median_pixels = (float(np.median(m)) for m in (bounds, bound_to_centre, pixels))
     keep("large regions", pixels <= MOST_PIXELS_NEEDED)
     keep("bound centre", measures[1] >= LEAST_BASIN)
     keep("bound without rim", disc_bound(FAMILY_GRID, inks, SIZES_PX[0], rim=False)[0] <= MOST_BOUND_PX)
@@ -276,9 +276,11 @@ def search(
     named = {code_of(p): p for p in known}
     patches = tuple(
         tuple(
-            named.get(int(code)) or family.patch(int(code), f"{code:08x}", len(named) + int(n))
-            for n, code in zip(members, codes[list(members)], strict=True)
+            named.get(int(code)) or family.patch(int(code), f"{code:08x}", len(named) + n)
+            for n, code in enumerate(codes[list(members)])
         )
         for members in sets
     )
-    return SearchResult(counts, *medians, patches, tuple(pair_distances(distance, members) for members in sets))
+    patches = tuple(tuple(sorted(members, key=lambda p: p.patch_id)) for members in patches)
+    distances = tuple(pair_distances(distance, members) for members in sets)
+    return SearchResult(counts, median_bound, median_basin, median_pixels, patches, distances)

@@ -1,6 +1,6 @@
 """Training: one loop over samples that are made on the fly, resumable to the bit.
 
-A recipe is a TOML file (:func:`load_recipe`). Progress is counted in samples, so that a recipe says the
+A recipe is a TOML file (:mod:`kpbench.recipe`). Progress is counted in samples, so that a recipe says the
 same on one processor and on eight accelerators. A checkpoint is one safetensors file with the weights,
 their running mean, the optimizer's moments and, as JSON, the recipe and the number of steps; batches are
 a function of (recipe, seed, step), hence nothing else is needed to go on as if nothing had happened.
@@ -17,16 +17,14 @@ import os
 import signal
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 import torch
 import torch.distributed as dist
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kpbench import __version__
@@ -34,273 +32,14 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
-from kpbench.network import CELL, NetworkConfig, SuperPoint, initialise, read_weights
-from kpbench.samples import Batch, Job, SampleConfig, load_photos, make_batch, stream
-from kpbench.store import canonical_json, write_atomic
+from kpbench.network import SuperPoint, initialise, losses, make_targets, read_weights
+from kpbench.recipe import Recipe, parse_recipe
+from kpbench.samples import Batch, Job, load_photos, make_batch, stream
+from kpbench.store import write_atomic
 
-__all__ = ["Loss", "Phase", "Recipe", "designs_digest", "evaluate", "load_recipe", "network_of", "read_checkpoint", "train"]
+__all__ = ["State", "designs_digest", "evaluate", "network_of", "read_checkpoint", "train", "validation_set"]
 
 SCHEMA = "kpbench.checkpoint/1"
-
-
-@dataclass(frozen=True)
-class Loss:
-    """What is minimised: detector + ``identity_weight`` · identity.
-
-    Attributes
-    ----------
-    place : str
-        Where in its cells a keypoint is asked for: "pixel" (the nearest one, as SuperPoint) or "split"
-        (shared out to the four around it by distance, across cell borders, so that the mean of the
-        distribution is the keypoint).
-    positive_weight : float
-        Weight of a cell that holds a keypoint, relative to one that holds none.
-    focal : float
-        Exponent of the focal loss (Lin et al., ICCV 2017) on "is there a keypoint in this cell"; 0: none.
-    identity : str
-        "entropy": cross-entropy over patches and "no patch" at cells within 8 px of a keypoint and beyond
-        16 px of all; "hinge": SuperPoint's descriptor loss against the one-hot map of every cell, where
-        cells of one class are no negatives of each other.
-    identity_weight : float
-    lambda_d, positive_margin, negative_margin : float
-        Of the hinge loss (Table 1).
-    """
-
-    place: str = "split"
-    positive_weight: float = 1.0
-    focal: float = 0.0
-    identity: str = "entropy"
-    identity_weight: float = 0.2
-    lambda_d: float = 640 * 480 / 5
-    positive_margin: float = 0.9
-    negative_margin: float = 0.2
-
-
-@dataclass(frozen=True)
-class Phase:
-    """A stretch of the training: how many samples, which weights learn, how strong degradations grow."""
-
-    samples: int
-    trains: str = "all"  # or "attached"
-    severity: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass(frozen=True)
-class Recipe:
-    """All that a training is a function of, besides photographs, designs and initial weights.
-
-    Attributes
-    ----------
-    name : str
-    phases : tuple of Phase
-    batch : samples a step, over all processes.
-    optimizer : "adam" (weight decay as L2, as in the paper) or "adamw".
-    lr, weight_decay : float
-    warmup : samples over which the learning rate rises from 0.
-    schedule : "step" (times ``decay`` at each of ``decay_at``) or "cosine" (down to ``decay`` at the end).
-    ema : decay of the running mean of the weights a step; the mean is what is evaluated and exported.
-    precision : "bf16" (autocast) or "fp32".
-    compile : whether to use ``torch.compile``.
-    """
-
-    name: str
-    phases: tuple[Phase, ...]
-    seed: int = 0
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    samples: SampleConfig = field(default_factory=SampleConfig)
-    loss: Loss = field(default_factory=Loss)
-    batch: int = 64
-    optimizer: str = "adamw"
-    lr: float = 1e-3
-    weight_decay: float = 1e-4
-    warmup: int = 0
-    schedule: str = "cosine"
-    decay: float = 0.05
-    decay_at: tuple[int, ...] = ()
-    ema: float = 0.999
-    precision: str = "bf16"
-    compile: bool = False
-
-    @property
-    def steps(self) -> int:
-        return sum(p.samples for p in self.phases) // self.batch
-
-    def phase(self, step: int) -> tuple[Phase, float]:
-        """The phase at a step, and the severity of degradations there."""
-        at = step * self.batch
-        for phase in self.phases:
-            if at < phase.samples:
-                break
-            at -= phase.samples
-        low, high = phase.severity
-        return phase, low + (high - low) * min(at / phase.samples, 1.0)
-
-    def rate(self, step: int) -> float:
-        """The learning rate at a step."""
-        at = step * self.batch
-        warm = min((at + self.batch) / self.warmup, 1.0) if self.warmup else 1.0
-        if self.schedule == "step":
-            return self.lr * warm * self.decay ** sum(at >= a for a in self.decay_at)
-        done = min(step / max(self.steps, 1), 1.0)
-        return self.lr * warm * (self.decay + (1 - self.decay) * 0.5 * (1 + np.cos(np.pi * done)))
-
-
-T = TypeVar("T")
-CHOICES = {
-    "place": ("pixel", "split"),
-    "identity": ("entropy", "hinge"),
-    "trains": ("all", "attached"),
-    "optimizer": ("adam", "adamw"),
-    "schedule": ("step", "cosine"),
-    "precision": ("bf16", "fp32"),
-    "kind": ("crops", "scenes"),
-}
-
-
-def load_recipe(path: str | Path) -> Recipe:
-    """Read a training recipe.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
-    """
-    try:
-        table = tomllib.loads(Path(path).read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read ({error})") from None
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: not valid TOML ({error})") from None
-    return _parse(Recipe, table, str(path), "")
-
-
-def _parse(cls: type[T], table: Any, source: str, place: str) -> T:
-    """A dataclass from its table, nested ones too; the types of the fields say what is expected."""
-    if not isinstance(table, Mapping):
-        raise DataError(f"{source}: {place or 'the recipe'} is {table!r}, expected a table")
-    hints = get_type_hints(cls)
-    values = {}
-    for key, value in table.items():
-        where = f"{place}.{key}" if place else key
-        if key not in hints:
-            raise DataError(f"{source}: unknown key {where}; known are: {', '.join(hints)}")
-        values[key] = _value(hints[key], value, source, where)
-        if key in CHOICES and value not in CHOICES[key]:
-            raise DataError(f"{source}: {where} is {value!r}, expected one of: {', '.join(CHOICES[key])}")
-    missing = [f.name for f in fields(cls) if f.name in ("name", "phases", "samples") and f.name not in values]  # type: ignore[arg-type]
-    try:
-        return cls(**values)
-    except TypeError:
-        raise DataError(f"{source}: {place or 'the recipe'} lacks {' and '.join(missing)}") from None
-    except DataError as error:
-        raise DataError(f"{source}: {error}") from None
-
-
-def _value(kind: Any, value: Any, source: str, where: str) -> Any:
-    if is_dataclass(kind):
-        return _parse(kind, value, source, where)  # type: ignore[arg-type]
-    if get_origin(kind) is tuple:
-        args = get_args(kind)
-        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
-            count = "" if args[-1] is Ellipsis else f"{len(args)} "
-            raise DataError(f"{source}: {where} is {value!r}, expected a list of {count}values")
-        return tuple(_value(args[0], v, source, f"{where}[{n}]") for n, v in enumerate(value))
-    accepted = (int, float) if kind is float else kind
-    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-        raise DataError(f"{source}: {where} is {value!r}, expected {kind.__name__}")
-    if kind is not bool and kind is not str and value < 0:
-        raise DataError(f"{source}: {where} is {value!r}, expected a number from 0")
-    return kind(value)
-
-
-# Losses ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Targets:
-    """What is asked of each cell.
-
-    Attributes
-    ----------
-    place : Tensor of shape (B, 65, h, w): probabilities, sum 1.
-    asked : Tensor of shape (B, h, w): 0 where a keypoint is ignored, else 1.
-    identity : Tensor of shape (B, h, w), int64: patch, or ``ids`` for none.
-    near, far : Tensor of shape (B, h, w), bool: within 8 px of a keypoint; beyond 16 px of all.
-    """
-
-    place: Tensor
-    asked: Tensor
-    identity: Tensor
-    near: Tensor
-    far: Tensor
-
-
-def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: str) -> Targets:
-    """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.samples.Batch`) on images of that size."""
-    count, h, w = len(keypoints), height // CELL, width // CELL
-    xy, patch, ignore = keypoints[..., :2], keypoints[..., 2], keypoints[..., 3]
-    wanted = (patch >= 0) & (ignore == 0)
-
-    low = torch.floor(xy if place == "split" else xy + 0.5)
-    part = xy - low if place == "split" else torch.zeros_like(xy)
-    image = torch.zeros(count, height * width, device=keypoints.device)
-    for dx, dy in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        x, y = (low[..., 0] + dx).long(), (low[..., 1] + dy).long()
-        share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
-        share = share * (wanted & (x >= 0) & (y >= 0) & (x < width) & (y < height))
-        image.scatter_add_(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1), share)
-    pixels = image.view(count, h, CELL, w, CELL).permute(0, 2, 4, 1, 3).reshape(count, CELL * CELL, h, w)
-    mass = pixels.sum(1, keepdim=True)
-    pixels = pixels / mass.clamp(min=1.0)
-    target = torch.cat([pixels, (1 - mass).clamp(min=0.0)], 1)
-
-    rows = torch.arange(h, device=keypoints.device) * CELL + (CELL - 1) / 2
-    columns = torch.arange(w, device=keypoints.device) * CELL + (CELL - 1) / 2
-    distance = torch.hypot(xy[:, :, 0, None, None] - columns, xy[:, :, 1, None, None] - rows[:, None])  # (B, K, h, w)
-    buried = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL / 2)).any(1)
-    asked = ~buried | (mass[:, 0] > 0)
-    nearest, which = distance.masked_fill(~wanted[..., None, None], float("inf")).min(1)
-    near = nearest <= CELL
-    identity = patch.long().gather(1, which.flatten(1)).view_as(which)
-    return Targets(
-        target, asked.float(), torch.where(near, identity, ids), near, (nearest > 2 * CELL) & ~buried
-    )
-
-
-def losses(detector: Tensor, ids: Tensor, targets: Targets, config: Loss) -> tuple[Tensor, Tensor]:
-    """(detector loss, identity loss) of raw head outputs (B, 65, h, w) and (B, ids + 1, h, w)."""
-    log_p = F.log_softmax(detector.float(), 1)
-    entropy = -(targets.place * log_p).sum(1)
-    mass = 1 - targets.place[:, -1]
-    weight = targets.asked * (1 + (config.positive_weight - 1) * mass)
-    if config.focal:
-        empty = log_p[:, -1].exp()
-        weight = weight * (mass * empty + (1 - mass) * (1 - empty)).detach() ** config.focal
-    located = (weight * entropy).sum() / targets.asked.sum().clamp(min=1.0)
-    hinge = _hinge if config.identity == "hinge" else _cross_entropy
-    return located, hinge(ids.float(), targets, config)
-
-
-def _cross_entropy(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
-    entropy = F.cross_entropy(ids, targets.identity, reduction="none")
-    near, far = targets.near, targets.far
-    return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
-
-
-def _hinge(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
-    """SuperPoint's descriptor loss (its eq. 4-6) of one image against the map of one-hot vectors.
-
-    The sum over pairs of cells is grouped by the class of the second cell: the dot product with a
-    one-hot vector is one channel of the normalised descriptor.
-    """
-    inside = targets.place[:, -1] < 1  # the class of a cell is the patch whose keypoint lies in it
-    identity = torch.where(inside, targets.identity, ids.shape[1] - 1)
-    dots = F.normalize(ids, dim=1).flatten(2)  # (B, C, cells)
-    onehot = F.one_hot(identity.flatten(1), ids.shape[1]).permute(0, 2, 1).float()
-    population = onehot.sum(2, keepdim=True)
-    positive = (onehot * F.relu(config.positive_margin - dots)).sum((1, 2)) * config.lambda_d
-    negative = ((1 - onehot) * population * F.relu(dots - config.negative_margin)).sum((1, 2))
-    return ((positive + negative) / dots.shape[2] ** 2).mean()
 
 
 # State and checkpoints ---------------------------------------------------------------------------------
@@ -384,9 +123,16 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 
 def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
     """The running mean of a checkpoint as a network in evaluation mode."""
-    network = SuperPoint(_parse(Recipe, content["recipe"], "checkpoint", "recipe").network)
+    network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
     network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
     return network.eval()
+
+
+def initial_weights(path: str | Path) -> dict[str, Tensor]:
+    """A state-dict to start from: published SuperPoint weights, or the running mean of a checkpoint."""
+    weights = read_weights(path)
+    mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
+    return mean or weights
 
 
 def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
@@ -398,7 +144,7 @@ def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
         If it cannot be read, or belongs to another recipe or other designs.
     """
     content, tensors = read_checkpoint(path)
-    theirs = _parse(Recipe, content["recipe"], str(path), "recipe")
+    theirs = parse_recipe(content["recipe"], str(path))
     changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(state.recipe, f.name)]
     if changed:
         raise DataError(f"{path}: was trained with another {' and '.join(changed)}; use another folder with --out")
@@ -459,7 +205,7 @@ def _average_gradients(network: nn.Module, world: int) -> None:
     flat = torch.cat([g.flatten() for g in gradients])
     dist.all_reduce(flat)
     flat /= world
-    for gradient, part in zip(gradients, flat.split([g.numel() for g in gradients]), strict=True):
+    for gradient, part in zip(gradients, torch.split(flat, [g.numel() for g in gradients]), strict=True):
         gradient.copy_(part.view_as(gradient))
 
 
@@ -499,6 +245,7 @@ def train(
     threads: int | None = None,
     save_every: float = 5.0,
     validate_every: float = 15.0,
+    validation_images: int = 32,
     tensorboard: bool = False,
     patches: Sequence[Patch] | None = None,
     say: Callable[[str], None] = lambda line: None,
@@ -512,7 +259,7 @@ def train(
     backgrounds : path, optional
         Folder of photographs; every tenth is kept for validation. None: procedural textures.
     init : path, optional
-        Published SuperPoint weights to start from, see :func:`kpbench.network.initialise`.
+        Published SuperPoint weights (:func:`kpbench.network.initialise`) or another checkpoint to start from.
     resume_run : bool
         Go on from the checkpoint in ``out``.
     minutes : float, optional
@@ -523,6 +270,8 @@ def train(
         Threads of torch.
     save_every, validate_every : float
         Minutes between checkpoints, and between validations.
+    validation_images : int
+        Whole images that are validated on, each with and without deteriorations; see :func:`validation_set`.
     tensorboard : bool
         Write the log for TensorBoard too.
     patches : sequence of Patch, optional
@@ -560,17 +309,21 @@ def train(
     if resume_run:
         resume(state, checkpoint, designs)
     elif init is not None:
-        say(initialise(state.network, read_weights(init), str(init)))
+        say(initialise(state.network, initial_weights(init), str(init)))
         state.mean.load_state_dict(state.network.state_dict())
     held_out = load_photos(backgrounds, "validation") if rank == 0 else []
-    validation = validation_set(recipe, designs, held_out) if rank == 0 else None
+    validation = validation_set(recipe, designs, held_out, validation_images) if rank == 0 else None
     jobs = (
         Job(step * world + rank, recipe.batch // world, recipe.phase(step)[1])
         for step in range(state.step, recipe.steps)
     )
     forward: nn.Module = torch.compile(state.network) if recipe.compile else state.network  # type: ignore[assignment]
 
-    with _recorder(folder, rank == 0, tensorboard) as record, _bar(state, rank) as advance, _stop_on_signal() as signalled:
+    with (
+        _recorder(folder, rank == 0, tensorboard) as record,
+        _bar(state, rank) as advance,
+        _stop_on_signal() as signalled,
+    ):
         saved = validated = noted = time.monotonic()
         before, first = state.seconds, state.step
         sums, since = torch.zeros(2, device=device), state.step
@@ -585,7 +338,9 @@ def train(
                 located, identified = (sums / (state.step - since)).tolist()
                 rate = (state.step - first) * recipe.batch / (now - began)
                 advance(state.step, f"{located:.4f} {identified:.4f}")
-                record(state, {"loss": located, "id_loss": identified, "lr": recipe.rate(state.step), "samples_s": rate})
+                record(
+                    state, {"loss": located, "id_loss": identified, "lr": recipe.rate(state.step), "samples_s": rate}
+                )
                 sums.zero_()
                 noted, since = now, state.step
             last = stop or state.step == recipe.steps
@@ -638,12 +393,16 @@ def _recorder(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]
     if tensorboard:
         from torch.utils.tensorboard import SummaryWriter
 
-        writer = SummaryWriter(folder)  # type: ignore[no-untyped-call]
+        writer = SummaryWriter(folder)
     with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
 
         def record(state: State, figures: Mapping[str, Any]) -> None:
             rounded = {k: float(f"{v:.5g}") for k, v in figures.items()}
-            at = {"step": state.step, "samples": state.step * state.recipe.batch, "minutes": round(state.seconds / 60, 2)}
+            at = {
+                "step": state.step,
+                "samples": state.step * state.recipe.batch,
+                "minutes": round(state.seconds / 60, 2),
+            }
             log.write(json.dumps(at | rounded) + "\n")
             log.flush()
             for key, value in figures.items() if writer else ():

@@ -12,7 +12,8 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.pipeline import SynthConfig, generate
+from kpbench.pipeline import generate
+from kpbench.synth import SynthConfig
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

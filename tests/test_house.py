@@ -17,8 +17,9 @@ LAYERS = [
     {"geometry", "outline", "raster"},
     {"design"},
     {"background", "board", "draw", "sheet", "sidecar", "tiling"},
-    {"scene", "degrade", "analysis"},
+    {"scene", "degrade", "cells", "analysis", "search", "design_figure"},
     {"samples", "camera"},
+    {"recipe"},
     {"store", "predictions"},
     {"refine"},
     {"detect"},
@@ -27,7 +28,21 @@ LAYERS = [
     {"pipeline"},
 ]
 EVALUATOR = {"score", "predictions", "report", "detect", "store"}
-GENERATOR = {"design", "scene", "degrade", "background", "board", "draw", "sheet", "tiling", "analysis", "samples"}
+GENERATOR = {
+    "design",
+    "scene",
+    "degrade",
+    "background",
+    "board",
+    "draw",
+    "sheet",
+    "tiling",
+    "cells",
+    "analysis",
+    "search",
+    "design_figure",
+    "samples",
+}
 TORCH = {"network", "train", "export"}
 
 

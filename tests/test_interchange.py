@@ -8,7 +8,8 @@ import pytest
 
 from kpbench.errors import DataError
 from kpbench.interchange import export_dataset
-from kpbench.pipeline import SynthConfig, generate
+from kpbench.pipeline import generate
+from kpbench.synth import SynthConfig
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ import pytest
 
 from kpbench import store
 from kpbench.errors import DataError
-from kpbench.pipeline import SynthConfig, generate, make_sample
+from kpbench.pipeline import generate
+from kpbench.synth import SynthConfig
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +63,15 @@ def test_the_shard_size_changes_no_image(photos, tmp_path):
 
 
 def test_an_image_depends_on_its_index_and_not_on_n(photos):
-    image = make_sample(config(photos), 7)[0]
-    again = make_sample(config(photos, n=5000), 7)[0]
+    image = config(photos).make(7)[0]
+    again = config(photos, n=5000).make(7)[0]
     assert (image.image == again.image).all()
-    other = make_sample(config(photos, seed=1), 7)[0]
+    other = config(photos, seed=1).make(7)[0]
     assert (image.image != other.image).any()
 
 
 def test_deterioration_leaves_the_scene_and_lowers_contrast(photos):
-    clean, worn = (make_sample(config(photos, deteriorate=d), 3)[0] for d in ("none", "paper"))
+    clean, worn = (config(photos, deteriorate=d).make(3)[0] for d in ("none", "paper"))
     assert len(clean.keypoints)
     for name in clean.keypoints.dtype.names:
         same = np.array_equal(clean.keypoints[name], worn.keypoints[name])

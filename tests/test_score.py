@@ -380,6 +380,7 @@ def test_a_detector_that_names_every_identity_at_one_place_gets_none(order):
     rows = [(10, 10, 0.5, 0), (10, 10, 0.5, 1), (10, 10, 0.5, 2)]
     scores = run(truth_of([[(10, 10, 50, 1)]]), [found(*(rows[k] for k in order))])
     assert scores["id_matching_score"] == 0
+    assert scores.confusion["matrix"] == [[0, 1]]
     assert run(truth_of([[(10, 10, 50, 1)]]), [found(*[rows[1]] * 3)])["id_matching_score"] == 1
 
 

@@ -16,6 +16,8 @@ COMMANDS = {
     "render-patches": ("patches:render_patches", "Print the patches or a board, true to scale."),
     "analyze-patches": ("analysis:analyze_patches", "Measure designs: localisation, confusion, look-alikes."),
     "synth": ("data:synth", "Write a synthetic labelled dataset."),
+    "suite": ("suites:suite", "Write the images of a benchmark suite: paper-v1, extended-v1."),
+    "degrade": ("suites:degrade", "Blur, dim, wet, ... images of your own."),
     "inspect": ("data:inspect", "Say what is in a dataset."),
     "verify": ("data:verify", "Check every byte of a dataset."),
     "preview": ("data:preview", "Draw a contact sheet with the true keypoints."),

@@ -53,10 +53,14 @@ def analyze_patches(
     found = None
     steps = analysis.STEPS + (search.STEPS if searching else 0)
     with tqdm(total=steps, desc="analysis", unit="step", disable=not sys.stderr.isatty(), dynamic_ncols=True) as bar:
+
+        def step() -> None:
+            bar.update()
+
         if searching:
-            found = search.search(windows, shipped_patches(), progress=bar.update)
+            found = search.search(windows, shipped_patches(), progress=step)
             patches = found.sets[0]
-        measured = analysis.analyse(patches, windows, bar.update)
+        measured = analysis.analyse(patches, windows, step)
     if found:
         click.echo(_search_table(found) + "\n")
     click.echo(_table(measured))
@@ -101,19 +105,30 @@ def _table(analysis: Analysis) -> str:
     names = [f"{d.patch_id} {d.name}" for d in analysis.designs]
     lines += _columns(names, head, rows)
     lines += ["", "Centre, orientation, smallest size, and look-alikes (share of places in images, correlation > 0.8):"]
-    head = ["crossing", "tilt bias px", "basin", "turns alike", "needs px", "in images", "blurred", "nearest", "distance"]
+    head = [
+        "crossing",
+        "tilt bias px",
+        "basin",
+        "turns alike",
+        "needs px",
+        "in images",
+        "blurred",
+        "nearest",
+        "distance",
+    ]
     rows = []
     for n, d in enumerate(analysis.designs):
         name, distance = analysis.nearest(n)
-        rows.append(
-            ["yes" if d.centre_is_crossing else "no", f"{d.tilt_bias_px:.2f}", f"{d.basin:.3f}"]
-            + [str(d.symmetry_order), f"{d.pixels_needed:.1f}"]
-            + [f"{100 * d.natural_response[0]:.3f} %", f"{100 * d.natural_response_blurred[0]:.2f} %"]
-            + [name or "-", f"{distance:.3f}"]
-        )
+        crossing = "yes" if d.centre_is_crossing else "no"
+        shares = (f"{100 * d.natural_response[0]:.3f} %", f"{100 * d.natural_response_blurred[0]:.2f} %")
+        measures = (f"{d.basin:.3f}", str(d.symmetry_order), f"{d.pixels_needed:.1f}")
+        rows.append([crossing, f"{d.tilt_bias_px:.2f}", *measures, *shares, name or "-", f"{distance:.3f}"])
     lines += _columns(names, head, rows)
     if len(names) > 1:
-        lines += ["", "Distance between designs, over rotation, tilt, mirror, gain and offset, blurred (ink contrasts):"]
+        lines += [
+            "",
+            "Distance between designs, over rotation, tilt, mirror, gain and offset, blurred (ink contrasts):",
+        ]
         lines += _columns(names, names, [[f"{v:.3f}" for v in row] for row in analysis.distance.tolist()])
     return "\n".join(lines)
 
@@ -134,7 +149,9 @@ def _columns(names: list[str], head: list[str], rows: list[list[str]]) -> list[s
     table = [["", *head], *([name, *row] for name, row in zip(names, rows, strict=True))]
     widths = [max(len(row[k]) for row in table) for k in range(len(table[0]))]
     return [
-        "  ".join(cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True)))
+        "  ".join(
+            cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        )
         for row in table
     ]
 

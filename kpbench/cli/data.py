@@ -44,26 +44,11 @@ def synth(
     Example:
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
     """
-    from kpbench.cli.progress import progress_bar
-    from kpbench.pipeline import SynthConfig, generate
+    from kpbench.cli.progress import write_dataset
+    from kpbench.synth import SynthConfig
 
-    if resume and overwrite:
-        raise click.UsageError("--resume and --overwrite exclude each other")
     config = SynthConfig(n, seed, size, channels, deteriorate, shard_size, backgrounds)
-    try:
-        with progress_bar(n, "synth") as progress:
-            run = generate(config, out, workers=workers, resume=resume, overwrite=overwrite, progress=progress)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
-    if run.broken:
-        shown = ", ".join(run.broken[:5]) + (" …" if len(run.broken) > 5 else "")
-        click.echo(
-            f"kpbench: {len(run.broken)} background files could not be decoded and were passed over: {shown}", err=True
-        )
-    dataset = run.dataset
-    click.echo(
-        f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}"
-    )
+    write_dataset(config, out, workers, resume, overwrite, "synth")
 
 
 @click.command()

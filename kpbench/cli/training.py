@@ -42,11 +42,13 @@ def train(
     """
     if init and resume:
         raise click.UsageError("--init and --resume exclude each other: a checkpoint holds its own weights")
+    from kpbench.recipe import load_recipe
+
+    recipe = load_recipe(config)
     try:
         from kpbench import train as training
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench train {INSTALL} ({error})") from None
-    recipe = training.load_recipe(config)
     folder = out or Path("runs") / recipe.name
     finished = training.train(
         recipe,

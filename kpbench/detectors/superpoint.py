@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
 
-__all__ = ["Decoding", "SuperPointDetector", "decode", "pad_to_cells", "to_grey"]
+__all__ = ["Decoding", "SuperPointDetector", "decode", "open_session", "pad_to_cells", "to_grey"]
 
 CELL = 8
 SCHEMA = "kpbench.superpoint/1"
@@ -137,6 +137,16 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
+def open_session(model: bytes, threads: int = 0) -> Any:
+    """An ``onnxruntime.InferenceSession`` on the processor; 0 threads leaves their number to it."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
 Refine = Callable[[UInt8, Detections], Detections]
 """Moves detections in a grey image to a better place, e.g. by fitting the design."""
 
@@ -167,16 +177,9 @@ class SuperPointDetector:
     threads: int = 0
 
     def __post_init__(self) -> None:
-        import onnxruntime
-
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = self.threads
-        options.log_severity_level = 3
         try:
-            data = Path(self.path).read_bytes()
-            self._session: Any = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-            self.metadata = dict(self._session.get_modelmeta().custom_metadata_map)
-            content = json.loads(self.metadata.get("kpbench", "{}"))
+            self._session = open_session(Path(self.path).read_bytes(), self.threads)
+            content = json.loads(self._session.get_modelmeta().custom_metadata_map.get("kpbench", "{}"))
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
             raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
         if content.get("schema") != SCHEMA:

@@ -1,0 +1,52 @@
+"""The command that runs a detector."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+__all__ = ["detect"]
+
+
+@click.command()
+@click.argument("source")
+@click.option("--detector", "name", default="template", show_default=True, help="A shipped detector, or MODULE:ATTR.")
+@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
+@click.option("--threshold", type=float, help="Drop detections of a lower score.")
+@click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
+@click.option("--workers", type=int, help="Processes, for a dataset; default: one a core.")
+def detect(
+    source: str, name: str, out: Path, threshold: float | None, overlay: Path | None, workers: int | None
+) -> None:
+    """Run a detector over SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
+
+    The predictions file (.json, .jsonl, .csv, .parquet, .h5) goes to --out; `kpbench score` reads it. Images
+    of a folder and frames of a video are numbered from 0, in order.
+
+    \b
+    Examples:
+      kpbench detect kpbench-data --detector template --out preds.json
+      kpbench detect photos --detector my_module:MyDetector --overlay drawn
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.pipeline import predict, predict_images
+    from kpbench.predictions import write_predictions
+    from kpbench.sources import open_images
+    from kpbench.store import open_dataset
+
+    if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
+        dataset = open_dataset(source)
+        with progress_bar(len(dataset), "detect") as progress:
+            run = predict(dataset, name, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
+    else:
+        images = open_images(source)
+        with progress_bar(images.length, "detect") as progress:
+            run = predict_images(images, name, threshold=threshold, overlay=overlay, progress=progress)
+    write_predictions(out, run.predictions)
+    click.echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
+    if run.failures:
+        for label, problem in run.failures[:5]:
+            click.echo(f"kpbench: {label}: {problem}", err=True)
+        click.echo(f"kpbench: {len(run.failures)} images failed, they count as no detections", err=True)
+        raise SystemExit(1)

@@ -1,0 +1,106 @@
+"""Commands of the benchmark's suites and of the ladder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from kpbench.cli.options import SIZE
+
+__all__ = ["degrade", "suite"]
+
+
+class Distortion(click.ParamType[tuple[float, ...]]):
+    """``k1,k2,p1,p2,k3`` as a tuple; trailing ones may be left out."""
+
+    name = "k1,k2,p1,p2,k3"
+
+    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(part) for part in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if not 1 <= len(numbers) <= 5:
+            self.fail(f"{value!r} is no distortion, expected up to five numbers: k1,k2,p1,p2,k3", param, ctx)
+        return numbers
+
+
+@click.command()
+@click.argument("name")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder; default: kpbench-suite/NAME.")
+@click.option("--images", type=int, help="Base scenes, each seen with every patch under every rung; default: 500.")
+@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
+@click.option("--only", metavar="CONDITION,…", help="Only these conditions, such as scale,blur.")
+@click.option("--distortion", type=Distortion(), help="Lens distortion as OpenCV's coefficients; default: none.")
+@click.option("--workers", type=int, help="Processes; default: one a core.")
+@click.option("--resume", is_flag=True, help="Finish an interrupted run.")
+@click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
+def suite(
+    name: str,
+    out: Path | None,
+    images: int | None,
+    seed: int,
+    backgrounds: Path | None,
+    size: tuple[int, int] | None,
+    only: str | None,
+    distortion: tuple[float, ...] | None,
+    workers: int | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Write the images of a benchmark suite: paper-v1, extended-v1, or a .toml file of your own.
+
+    \b
+    Examples:
+      kpbench suite paper-v1 --images 20 --size 640x480
+      kpbench suite paper-v1 --only scale,blur --backgrounds photos/ --out scale-and-blur
+    """
+    from kpbench.cli.progress import write_dataset
+    from kpbench.suite import SuiteConfig, load_suite
+
+    chosen = () if only is None else tuple(part.strip() for part in only.split(",") if part.strip())
+    config = SuiteConfig(load_suite(name), images, seed, size, chosen, backgrounds, distortion or ())
+    write_dataset(config, out or Path("kpbench-suite") / config.suite.name, workers, resume, overwrite, "suite")
+
+
+@click.command()
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--effect", "effects", multiple=True, required=True, help="An effect of the ladder; repeatable, in order."
+)
+@click.option("--level", "levels", type=float, multiple=True, required=True, help="Its level; one for each effect.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("degraded"), show_default=True, help="Folder.")
+@click.option("--seed", type=int, default=0, show_default=True)
+def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
+    """Degrade an image, or all images of a folder, and write them as PNG.
+
+    Prints one line an image: the file, and what was applied as JSON.
+
+    \b
+    Effects and their rungs in the suites:
+      blur 3 7 11 15 px · dimming 10 20 30 40 · noise 15 30 45 60 grey levels · gaussian-blur · motion-blur
+      defocus · shadow-edge · rain · jpeg · low-light · occlusion · flare
+
+    \b
+    Examples:
+      kpbench degrade photo.jpg --effect blur --level 7
+      kpbench degrade photos/ --effect motion-blur --level 20 --effect noise --level 15 --out worn
+    """
+    import json
+
+    from kpbench.cli.progress import progress_bar
+    from kpbench.pipeline import degrade_files, image_files
+
+    if len(effects) != len(levels):
+        raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
+    steps = tuple(zip(effects, levels, strict=True))
+    photos = image_files(source)
+    with progress_bar(len(photos.files), "degrade") as progress:
+        for path, applied in degrade_files(photos, out, steps, seed):
+            click.echo(f"{path} {json.dumps(applied)}")
+            progress(1)

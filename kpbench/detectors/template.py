@@ -1,0 +1,178 @@
+"""A classical detector: no training, any design with straight edges that cross at its centre.
+
+Edges that meet at a point point at it, under any perspective. So the first stage (:func:`crossings`)
+asks of every pixel whether the gradients around it are square to the direction to it, and are of more than
+one direction (a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
+location of distinct points*, 1987). That needs no templates. The few hundred places that remain are
+compared with the designs by :mod:`kpbench.refine`, coarse to fine, each stage on what the one before kept.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench import __version__, refine
+from kpbench.design import Patch, shipped_patches
+from kpbench.detect import suppress, to_grey
+from kpbench.keypoints import Detections, Float, UInt8
+
+__all__ = ["TemplateDetector", "crossings"]
+
+Float32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+WINDOW_PX = 1.1
+"""Standard deviation of the window, in px of a level: it sees 1 to 3 px around a place."""
+RADIAL = 0.5
+"""How much a gradient along the direction to the place counts against one across it."""
+EVERY_PX, AT_LEAST = 770, 100
+"""Places kept: one for so many pixels of the level, and some for small ones."""
+
+
+def crossings(level: Float32) -> tuple[Float, Float]:
+    """Places where edges of several directions meet.
+
+    Parameters
+    ----------
+    level : ndarray of shape (H, W), float32, grey levels.
+
+    Returns
+    -------
+    xy : ndarray of shape (n, 2), whole px; the best places, at most one for every 770 px, and 100.
+    strength : ndarray of shape (n,), in falling order.
+    """
+    gx = cv2.Scharr(level, cv2.CV_32F, 1, 0, scale=1 / 32)
+    gy = cv2.Scharr(level, cv2.CV_32F, 0, 1, scale=1 / 32)
+    q = np.arange(-4.0, 5.0)
+    weight = np.exp(-(q**2) / (2 * WINDOW_PX**2))
+    moments = [weight / weight.sum() * q**n for n in range(3)]
+
+    def around(image: Float32, nx: int, ny: int) -> Float32:
+        """Sum over q of w(q) qx^nx qy^ny image(p + q)."""
+        return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, moments[nx], moments[ny]))
+
+    xx, xy, yy = gx * gx, gx * gy, gy * gy
+    xx_x, yy_y, xy_xy = around(xx, 2, 0), around(yy, 0, 2), around(xy, 1, 1)
+    radial = xx_x + 2 * xy_xy + yy_y  # sum of w (g·q)²
+    a, c = xx_x + around(xx, 0, 2), yy_y + around(yy, 2, 0)
+    b = around(xy, 2, 0) + around(xy, 0, 2)
+    least = (a + c) / 2 - np.sqrt(((a - c) / 2) ** 2 + b * b)  # smaller eigenvalue of the sum of w |q|² g gᵀ
+    strength = (least - RADIAL * radial) / np.sqrt(a + c + 50.0)
+    strength[[0, -1]], strength[:, [0, -1]] = 0, 0
+    peak = (strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > 0)
+    rows, columns = np.nonzero(peak)
+    found = strength[rows, columns]
+    best = np.argsort(-found, kind="stable")[: level.size // EVERY_PX + AT_LEAST]
+    return np.column_stack([columns, rows])[best].astype(np.float64), found[best].astype(np.float64)
+
+
+CORE, WHOLE, MOST = 0.87, 0.7, 80
+"""Least correlations of a candidate near its centre and as a whole; most candidates that are fitted."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """What was fitted in one image, with overlaps and whatever its score.
+
+    Attributes
+    ----------
+    which : (n,) index of the design.
+    core, whole : (n,) correlations near the centre and over the disc, before the fit.
+    fit : the fits.
+    noise : standard deviation of the image's noise, grey levels.
+    """
+
+    which: Ints
+    core: Float
+    whole: Float
+    fit: refine.Fit
+    noise: float
+
+    @property
+    def score(self) -> Float:
+        """(n,) in [0, 1]."""
+        return np.zeros(len(self.which))
+
+
+@dataclass(frozen=True)
+class TemplateDetector:
+    """Finds patches by comparing the image with their designs; call it with an image.
+
+    Attributes
+    ----------
+    patches : the designs to look for.
+    threshold : least score of a detection, in [0, 1].
+    """
+
+    patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
+    threshold: float = 0.5
+    name: str = "template"
+    version: str = __version__
+
+    def __call__(self, image: UInt8) -> Detections:
+        """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
+        found = self.candidates(to_grey(image))
+        score = found.score
+        order = np.argsort(-score, kind="stable")
+        order = order[score[order] >= self.threshold]
+        kept = order[_uncovered(found.fit.xy[order], found.fit.A[order], 0.9)]
+        ids = np.array([patch.patch_id for patch in self.patches], np.int64)
+        return Detections(found.fit.xy[kept], score[kept], ids[found.which[kept]])
+
+    detect = __call__
+
+    def candidates(self, grey: UInt8) -> Candidates:
+        """Everything in a grey image that is enough like a design to be fitted."""
+        known = refine.bank(self.patches)
+        raw, smooth = refine.pyramid(grey, 0), refine.pyramid(grey)
+        poses = refine.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
+        poses = poses[poses.ncc > 0.62]
+        for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
+            poses = refine.align(smooth, poses, known.core, steps, 0.9 * refine.RING_PX)
+            poses = poses[poses.ncc > least]
+        poses = poses[np.argsort(-poses.ncc, kind="stable")]
+        core = poses[_distinct(poses)[:MOST]]
+        whole = refine.align(smooth, refine.extend(smooth, core, known), known.whole, 4, 5.6)
+        sure = whole.ncc > WHOLE
+        core, whole = core[sure], whole[sure]
+        fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
+        return Candidates(whole.which, core.ncc, whole.ncc, fit, _noise(raw[0]))
+
+
+def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
+    """Crossings of four octaves: (n, 2) px of the image, and the octave of each."""
+    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5)), *smooth[1:4]]
+    xy = [crossings(level)[0] for level in levels]
+    return np.concatenate([points * 2**n for n, points in enumerate(xy)]), np.repeat(np.arange(len(xy)), [len(points) for points in xy])
+
+
+def _noise(image: Float32) -> float:
+    """Standard deviation of noise from the median of second differences, which edges hardly move."""
+    kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
+    return 1.4826 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
+
+
+def _distinct(poses: refine.Poses) -> Ints:
+    """Indices of poses, best first, without those that repeat a better one of the same or of a much better design."""
+    n = len(poses)
+    offset = poses.xy[:, None] - poses.xy
+    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < 0.7
+    near |= near.T
+    rival = near & ((poses.which[:, None] == poses.which) | (poses.ncc[:, None] > poses.ncc + 0.05))
+    kept = np.zeros(n, bool)
+    for k in range(n):
+        kept[k] = not np.any(rival[kept, k])
+    return np.flatnonzero(kept)
+
+
+def _uncovered(xy: Float, A: Float, reach: float) -> Ints:
+    """Indices of points, best first, that lie in no better one's disc, scaled by ``reach``."""
+    inside = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None]), axis=2) < reach
+    kept = np.zeros(len(xy), bool)
+    for k in range(len(xy)):
+        kept[k] = not np.any(inside[kept, k])
+    return np.flatnonzero(kept)

@@ -1,0 +1,238 @@
+"""Training recipes: TOML in, frozen :class:`Recipe` out. Known without torch."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from pathlib import Path
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from kpbench.errors import DataError
+from kpbench.samples import SampleConfig
+
+__all__ = ["Loss", "NetworkConfig", "Phase", "Recipe", "load_recipe", "parse_recipe"]
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes of the network; the defaults are SuperPoint's.
+
+    Attributes
+    ----------
+    widths : tuple of 4 int
+        Channels of the encoder's stages, at strides 1, 2, 4 and 8.
+    depths : tuple of 4 int
+        3x3 convolutions in each stage.
+    down : str
+        What halves the image after each of the first three stages: "max" (max-pooling) or "stride"
+        (the stage's last convolution has stride 2).
+    head_width, descriptor_width : int
+        Channels of the hidden layer of each head, and of the descriptor.
+    norm : str
+        BatchNorm "before" the activation (folds into the convolution at export) or "after" it (as in the
+        published SuperPoint weights, which need that).
+    ids : int
+        Number of patches that the ID head tells apart, besides "no patch".
+    """
+
+    widths: tuple[int, int, int, int] = (64, 64, 128, 128)
+    depths: tuple[int, int, int, int] = (2, 2, 2, 2)
+    down: str = "max"
+    head_width: int = 256
+    descriptor_width: int = 256
+    norm: str = "before"
+    ids: int = 4
+
+    def __post_init__(self) -> None:
+        if len(self.widths) != 4 or len(self.depths) != 4 or min(*self.widths, *self.depths) < 1:
+            raise DataError(
+                f"network: widths {self.widths} and depths {self.depths}, expected four positive numbers each"
+            )
+        if self.down not in ("max", "stride") or self.norm not in ("before", "after"):
+            raise DataError(
+                f"network: down is {self.down!r} and norm {self.norm!r}, expected max or stride, and before or after"
+            )
+
+
+@dataclass(frozen=True)
+class Loss:
+    """What is minimised: detector + ``identity_weight`` · identity.
+
+    Attributes
+    ----------
+    place : str
+        Where in its cells a keypoint is asked for: "pixel" (the nearest one, as SuperPoint) or "split"
+        (shared out to the four around it by distance, across cell borders, so that the mean of the
+        distribution is the keypoint).
+    positive_weight : float
+        Weight of a cell that holds a keypoint, relative to one that holds none.
+    focal : float
+        Exponent of the focal loss (Lin et al., ICCV 2017) on "is there a keypoint in this cell"; 0: none.
+    identity : str
+        "entropy": cross-entropy over patches and "no patch" at cells within 8 px of a keypoint and beyond
+        16 px of all; "hinge": SuperPoint's descriptor loss against the one-hot map of every cell, where
+        cells of one class are no negatives of each other.
+    identity_weight : float
+    lambda_d, positive_margin, negative_margin : float
+        Of the hinge loss (Table 1).
+    """
+
+    place: str = "split"
+    positive_weight: float = 1.0
+    focal: float = 0.0
+    identity: str = "entropy"
+    identity_weight: float = 0.2
+    lambda_d: float = 640 * 480 / 5
+    positive_margin: float = 0.9
+    negative_margin: float = 0.2
+
+
+@dataclass(frozen=True)
+class Phase:
+    """A stretch of the training: how many samples, which weights learn, how strong degradations grow."""
+
+    samples: int
+    trains: str = "all"  # or "attached"
+    severity: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """All that a training is a function of, besides photographs, designs and initial weights.
+
+    Attributes
+    ----------
+    name : str
+    phases : tuple of Phase
+    batch : samples a step, over all processes.
+    optimizer : "adam" (weight decay as L2, as in the paper) or "adamw".
+    lr, weight_decay : float
+    warmup : samples over which the learning rate rises from 0.
+    schedule : "step" (times ``decay`` at each of ``decay_at``) or "cosine" (down to ``decay`` at the end).
+    ema : decay of the running mean of the weights a step; the mean is what is evaluated and exported.
+    precision : "bf16" (autocast) or "fp32".
+    compile : whether to use ``torch.compile``.
+    """
+
+    name: str
+    phases: tuple[Phase, ...]
+    seed: int = 0
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    samples: SampleConfig = field(default_factory=SampleConfig)
+    loss: Loss = field(default_factory=Loss)
+    batch: int = 64
+    optimizer: str = "adamw"
+    lr: float = 1e-3
+    weight_decay: float = 1e-4
+    warmup: int = 0
+    schedule: str = "cosine"
+    decay: float = 0.05
+    decay_at: tuple[int, ...] = ()
+    ema: float = 0.999
+    precision: str = "bf16"
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.phases or min(p.samples for p in self.phases) < 1 or self.batch < 1:
+            raise DataError("phases and batch: expected at least one phase, of at least one sample, and a batch from 1")
+
+    @property
+    def steps(self) -> int:
+        """Steps of the optimizer from start to end."""
+        return sum(p.samples for p in self.phases) // self.batch
+
+    def phase(self, step: int) -> tuple[Phase, float]:
+        """The phase at a step, and the severity of degradations there."""
+        at = step * self.batch
+        for phase in self.phases[:-1]:
+            if at < phase.samples:
+                break
+            at -= phase.samples
+        else:
+            phase = self.phases[-1]
+        low, high = phase.severity
+        return phase, low + (high - low) * min(at / phase.samples, 1.0)
+
+    def rate(self, step: int) -> float:
+        """The learning rate at a step."""
+        at = step * self.batch
+        warm = min((at + self.batch) / self.warmup, 1.0) if self.warmup else 1.0
+        if self.schedule == "step":
+            return self.lr * warm * self.decay ** sum(at >= a for a in self.decay_at)
+        done = min(step / max(self.steps, 1), 1.0)
+        return self.lr * warm * (self.decay + (1 - self.decay) * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+T = TypeVar("T")
+CHOICES = {
+    "place": ("pixel", "split"),
+    "identity": ("entropy", "hinge"),
+    "trains": ("all", "attached"),
+    "optimizer": ("adam", "adamw"),
+    "schedule": ("step", "cosine"),
+    "precision": ("bf16", "fp32"),
+    "kind": ("crops", "scenes"),
+}
+
+
+def load_recipe(path: str | Path) -> Recipe:
+    """Read a training recipe.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: not valid TOML ({error})") from None
+    return parse_recipe(table, str(path))
+
+
+def parse_recipe(table: Any, source: str) -> Recipe:
+    """A recipe from its table, see :func:`load_recipe`; ``source`` names it in messages."""
+    return _parse(Recipe, table, source, "")
+
+
+def _parse(cls: type[T], table: Any, source: str, place: str) -> T:
+    """A dataclass from its table, nested ones too; the types of the fields say what is expected."""
+    if not isinstance(table, Mapping):
+        raise DataError(f"{source}: {place or 'the recipe'} is {table!r}, expected a table")
+    hints = get_type_hints(cls)
+    values = {}
+    for key, value in table.items():
+        where = f"{place}.{key}" if place else key
+        if key not in hints:
+            raise DataError(f"{source}: unknown key {where}; known are: {', '.join(hints)}")
+        values[key] = _value(hints[key], value, source, where)
+        if key in CHOICES and value not in CHOICES[key]:
+            raise DataError(f"{source}: {where} is {value!r}, expected one of: {', '.join(CHOICES[key])}")
+    missing = [f.name for f in fields(cls) if f.name in ("name", "phases", "samples") and f.name not in values]  # type: ignore[arg-type]
+    try:
+        return cls(**values)
+    except TypeError:
+        raise DataError(f"{source}: {place or 'the recipe'} lacks {' and '.join(missing)}") from None
+    except DataError as error:
+        raise DataError(f"{source}: {error}") from None
+
+
+def _value(kind: Any, value: Any, source: str, where: str) -> Any:
+    if is_dataclass(kind):
+        return _parse(kind, value, source, where)  # type: ignore[arg-type]
+    if get_origin(kind) is tuple:
+        args = get_args(kind)
+        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
+            count = "" if args[-1] is Ellipsis else f"{len(args)} "
+            raise DataError(f"{source}: {where} is {value!r}, expected a list of {count}values")
+        return tuple(_value(args[0], v, source, f"{where}[{n}]") for n, v in enumerate(value))
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise DataError(f"{source}: {where} is {value!r}, expected {kind.__name__}")
+    if kind is not bool and kind is not str and value < 0:
+        raise DataError(f"{source}: {where} is {value!r}, expected a number from 0")
+    return kind(value)

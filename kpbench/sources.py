@@ -1,0 +1,129 @@
+"""Images from where a user has them: a file, a folder, a video, a camera."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from kpbench.errors import DataError
+from kpbench.keypoints import UInt8
+
+__all__ = ["Source", "image_writer", "open_images"]
+
+IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
+VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+
+
+@dataclass(frozen=True)
+class Source:
+    """Named images in order: RGB or grey uint8, or None for a file that cannot be decoded.
+
+    ``length`` is their number, None where nobody knows it; ``fps`` that of a video or camera, else None.
+    """
+
+    images: Iterator[tuple[str, UInt8 | None]]
+    length: int | None
+    fps: float | None = None
+
+
+def open_images(source: str) -> Source:
+    """Images of ``camera:N``, a video file, an image file, or a folder (by name, subfolders too).
+
+    Raises
+    ------
+    DataError
+        If there is nothing, or nothing that can be opened.
+    """
+    path = Path(source)
+    if source.startswith("camera:"):
+        number = source.removeprefix("camera:")
+        if not number.isdigit():
+            raise DataError(f"{source}: expected camera:0, camera:1, …")
+        return _video(cv2.VideoCapture(int(number)), source, None)
+    if path.is_dir():
+        files = sorted(f for f in path.rglob("*") if f.suffix.lower() in IMAGES)
+        if not files:
+            raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGES)})")
+        return Source(((f.relative_to(path).as_posix(), _decode(f)) for f in files), len(files))
+    if not path.exists():
+        raise DataError(f"{path}: no such dataset, image, folder or video")
+    if path.suffix.lower() in VIDEOS:
+        capture = cv2.VideoCapture(str(path))
+        return _video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+    image = _decode(path)
+    if image is None:
+        raise DataError(f"{path}: cannot be decoded as an image")
+    return Source(iter([(path.name, image)]), 1)
+
+
+def _decode(path: Path) -> UInt8 | None:
+    try:
+        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
+    except (OSError, cv2.error):
+        return None
+    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> Source:
+    if not capture.isOpened():
+        raise DataError(f"{name}: cannot be opened as a video")
+
+    def frames() -> Iterator[tuple[str, UInt8 | None]]:
+        number = 0
+        while True:
+            good, frame = capture.read()
+            if not good:
+                capture.release()
+                return
+            yield f"{number:08d}.png", np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+            number += 1
+
+    return Source(frames(), length if length and length > 0 else None, capture.get(cv2.CAP_PROP_FPS) or 25.0)
+
+
+@contextmanager
+def image_writer(target: Path | None, fps: float | None = None) -> Iterator[Callable[[str, UInt8], None]]:
+    """Write RGB images: into a folder as PNG under their names, or, if ``target`` ends in .mp4, as a video.
+
+    Raises
+    ------
+    DataError
+        If the target cannot be written.
+    """
+    if target is None:
+        yield lambda name, image: None
+        return
+    try:
+        (target.parent if target.suffix.lower() in VIDEOS else target).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{target}: cannot be written, {error.strerror}") from None
+    if target.suffix.lower() not in VIDEOS:
+
+        def write_file(name: str, image: UInt8) -> None:
+            path = (target / name).with_suffix(".png")
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
+                raise DataError(f"{path}: cannot be written")
+
+        yield write_file
+        return
+    video: list[cv2.VideoWriter] = []
+
+    def write_frame(name: str, image: UInt8) -> None:
+        if not video:
+            size = (image.shape[1], image.shape[0])
+            video.append(cv2.VideoWriter(str(target), cv2.VideoWriter.fourcc(*"mp4v"), fps or 25.0, size))
+            if not video[0].isOpened():
+                raise DataError(f"{target}: cannot be written as a video, expected a name ending in .mp4")
+        video[0].write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+    try:
+        yield write_frame
+    finally:
+        for writer in video:
+            writer.release()

@@ -1,0 +1,373 @@
+"""Suites: the benchmark's experiments as data, and the recipe of every image in them.
+
+A suite is a TOML file (``benchmarks/suites``): a camera, what a scene may look like, and conditions with
+their rungs. Image and truth are a function of (suite, seed, size, lens, background files) and of nothing
+else. One base scene - background, pose, inks, light - is seen with every patch under every rung, and its
+images share their ``scene_id``; so do the random numbers of the effects. Comparisons are paired.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench import degrade, store
+from kpbench.background import Background, PhotoFolder, procedural
+from kpbench.board import Board, find_patch, hexagon_board, keys, number
+from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
+from kpbench.design import Patch, shipped_patches
+from kpbench.errors import DataError, DesignError
+from kpbench.geometry import Camera
+from kpbench.scene import measure_contrast
+
+__all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "load_suite", "shipped_suites"]
+
+SCHEMA = "kpbench.suite/1"
+BOARD_SIDE_MM = 187.5  # a disc of 30 mm
+KEPT_BYTES = 256 * 2**20  # of backgrounds in memory; changes no result
+# Streams of random numbers of one scene; 0 to 2 belong to synth
+BACKGROUND, SCENE, EFFECT, FIELD = range(16, 20)
+
+SCENE_KEYS = {  # least and most that a suite may ask for
+    "area_percent": (0.01, 90.0),
+    "pitch_deg": (-80.0, 80.0),
+    "yaw_deg": (-80.0, 80.0),
+    "roll_deg": (0.0, 360.0),
+    "shift_x": (-0.5, 0.5),
+    "shift_y": (-0.5, 0.5),
+    "white": (0.0, 255.0),
+    "black": (0.0, 255.0),
+    "edge": (0.0, 1.0),
+    "light": (0.0, 1.0),
+    "slope_x": (-1.0, 1.0),
+    "slope_y": (-1.0, 1.0),
+    "shadow": (0.0, 1.0),
+}
+Levels = tuple[tuple[str, tuple[float, ...]], ...]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One experiment: ``pose`` and ``effects`` list, by name, a value for each rung; effects are in order."""
+
+    name: str
+    unit: str
+    rungs: tuple[float, ...]
+    pose: Levels
+    effects: Levels
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A suite as its file gives it; ``scene`` holds (least, most) of everything that is drawn for a scene."""
+
+    name: str
+    images: int
+    patches: tuple[Patch, ...]
+    size_px: tuple[int, int]
+    lens_mm: float
+    pixel_um: float
+    scene: tuple[tuple[str, tuple[float, float]], ...]
+    conditions: tuple[Condition, ...]
+
+    def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
+        """The camera at another image size with the same horizontal field of view."""
+        width, height = size_px or self.size_px
+        focal_px = self.lens_mm / (self.pixel_um / 1000) * width / self.size_px[0]
+        k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
+        return Camera(width, height, focal_px, (k1, k2, p1, p2, k3))
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What one image of a suite will show, before anything is painted."""
+
+    condition: str
+    rung: float
+    scene: int
+    board: Board
+    pose: Pose
+    look: Look
+    effects: list[dict[str, Any]]
+    keypoints: NDArray[Any]
+
+
+@dataclass(frozen=True)
+class SuiteConfig:
+    """All that a suite's images are a function of, besides the background files.
+
+    Attributes
+    ----------
+    suite : Suite
+    images : base scenes; None for the suite's own number. Fewer are the first of more.
+    seed : any whole number from 0.
+    size_px : (width, height); None for the suite's own. The field of view stays.
+    only : names of conditions; empty for all.
+    backgrounds : folder of photographs, or None for procedural ones.
+    distortion : OpenCV's k1, k2, p1, p2, k3; what is left out is 0.
+    shard_size : images a shard; changes the files but no image.
+
+    Raises
+    ------
+    DataError
+        If a value is out of its range or a condition is not known.
+    """
+
+    suite: Suite
+    images: int | None = None
+    seed: int = 0
+    size_px: tuple[int, int] | None = None
+    only: tuple[str, ...] = ()
+    backgrounds: Path | None = None
+    distortion: tuple[float, ...] = ()
+    shard_size: int = 100  # 200 MB of pixels at 1624x1240
+
+    def __post_init__(self) -> None:
+        def need(good: bool, what: str) -> None:
+            if not good:
+                raise DataError(what)
+
+        width, height = self.camera.width_px, self.camera.height_px
+        need(1 <= self.scenes <= 10**6, f"--images is {self.scenes}, expected a number of scenes from 1 to 1,000,000")
+        need(self.seed >= 0, f"--seed is {self.seed}, expected a whole number from 0")
+        need(min(width, height) >= 64, f"--size is {width}x{height}, expected at least 64x64")
+        need(max(width, height) <= 16384, f"--size is {width}x{height}, at most 16384 a side")
+        need(self.shard_size >= 1, f"the shard size is {self.shard_size}, expected a number of images from 1")
+        known = [c.name for c in self.suite.conditions]
+        for name in self.only:
+            need(name in known, f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
+
+    @property
+    def scenes(self) -> int:
+        """Number of base scenes."""
+        return self.suite.images if self.images is None else self.images
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The camera at the size asked for."""
+        return self.suite.camera(self.size_px, self.distortion)
+
+    @cached_property
+    def rungs(self) -> tuple[tuple[Condition, int], ...]:
+        """Every rung in the order of the images, as (condition, position in it)."""
+        chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
+        return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
+
+    @property
+    def n(self) -> int:
+        """Number of images: rungs x patches x scenes."""
+        return len(self.rungs) * len(self.suite.patches) * self.scenes
+
+    @property
+    def image_bytes(self) -> int:
+        """Expected size on disk of one image."""
+        return int(0.6 * self.camera.width_px * self.camera.height_px)
+
+    @cached_property
+    def photos(self) -> PhotoFolder | None:
+        """The listed background folder."""
+        return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
+
+    @cached_property
+    def _kept(self) -> dict[int, Background]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key not in ("photos", "_kept")}
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is written into the dataset: no path, so that a moved folder gives the same bytes."""
+        photos, camera = self.photos, self.camera
+        source: dict[str, Any] = {"kind": "procedural"}
+        if photos is not None:
+            source = {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
+        conditions = {c.name: c for c, _ in self.rungs}.values()
+        return {
+            "kind": "suite",
+            "suite": self.suite.name,
+            "n": self.n,
+            "images": self.scenes,
+            "seed": self.seed,
+            "size_px": [camera.width_px, camera.height_px],
+            "focal_px": camera.focal_px,
+            "distortion": list(camera.distortion),
+            "shard_size": self.shard_size,
+            "backgrounds": source,
+            "scene": {key: list(span) for key, span in self.suite.scene},
+            "conditions": [_listed(c) for c in conditions],
+            "patches": [patch.to_dict() for patch in self.suite.patches],
+        }
+
+    def shot(self, index: int) -> Shot:
+        """Pose, light, effects and truth of one image; nothing is painted.
+
+        Images are ordered by condition, rung, patch and scene.
+        """
+        rest, scene = divmod(index, self.scenes)
+        rung, patch = divmod(rest, len(self.suite.patches))
+        condition, step = self.rungs[rung]
+        rng = _stream(self.seed, scene, SCENE)
+        drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
+        drawn |= {key: values[step] for key, values in condition.pose}
+        tilt = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
+        board = _board(self.suite.patches[patch])
+        shift = (drawn["shift_x"], drawn["shift_y"])
+        pose = pose_board(self.camera, board, drawn["area_percent"], shift=shift, **tilt)
+        slope = (drawn["slope_x"], drawn["slope_y"])
+        look = Look(drawn["black"], drawn["white"], drawn["edge"], drawn["light"], slope, drawn["shadow"])
+        keypoints = board_keypoints(self.camera, pose, board)
+        discs = np.column_stack([keypoints["x"], keypoints["y"], keypoints["radius_major"].astype(np.float64)])
+        rng = _stream(self.seed, scene, EFFECT)
+        size = (self.camera.width_px, self.camera.height_px)
+        effects = [degrade.climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
+        return Shot(condition.name, condition.rungs[step], scene, board, pose, look, effects, keypoints)
+
+    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
+        """Image ``index``, and the broken background files met on the way."""
+        shot = self.shot(index)
+        background = self._background(shot.scene)
+        clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
+        image = degrade.apply(clean.image, _stream(self.seed, shot.scene, FIELD), shot.effects)
+        keypoints = clean.keypoints
+        for effect in shot.effects:
+            if effect["effect"] == "occlusion":
+                open_ = [m.disc * (1 - degrade.occlusion_cover(effect["strips"], m.box)) for m in clean.masks]
+                keypoints["visible"] *= [part.sum() / m.disc.sum() for part, m in zip(open_, clean.masks, strict=True)]
+        keypoints["contrast"] = measure_contrast(image, clean.masks)
+        sample = store.Sample(
+            index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene
+        )
+        return sample, background.broken
+
+    def _background(self, scene: int) -> Background:
+        """The background of a scene; the first ones that fit are kept, as every scene comes back under each rung."""
+        if scene in self._kept:
+            return self._kept[scene]
+        rng, (width, height) = _stream(self.seed, scene, BACKGROUND), (self.camera.width_px, self.camera.height_px)
+        if self.photos is None:
+            background = Background(procedural(rng, width, height))
+        else:
+            background = self.photos.sample(rng, width, height, 1)
+        if len(self._kept) < KEPT_BYTES // background.image.nbytes:
+            self._kept[scene] = background
+        return background
+
+
+def _stream(seed: int, scene: int, stage: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(scene, stage))))
+
+
+@lru_cache(maxsize=64)
+def _board(patch: Patch) -> Board:
+    return hexagon_board(patch, BOARD_SIDE_MM)
+
+
+def _listed(condition: Condition) -> dict[str, Any]:
+    """A condition for the config; effects as a list, because their order counts."""
+    pose = {key: list(values) for key, values in condition.pose}
+    effects = [[name, list(levels)] for name, levels in condition.effects]
+    return {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
+
+
+def shipped_suites() -> dict[str, Path]:
+    """The suites that ship with kpbench: name to file."""
+    inside = resources.files("kpbench") / "suites"
+    folder = Path(str(inside)) if inside.is_dir() else Path(__file__).parent.parent / "benchmarks" / "suites"
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def load_suite(name: str) -> Suite:
+    """Read a suite: a shipped one by its name, or any by the path of its TOML file.
+
+    Raises
+    ------
+    DataError
+        If there is none, or one line that names the file, the key and what was expected.
+    """
+    shipped = shipped_suites()
+    path = shipped.get(name, Path(name))
+    if name not in shipped and path.suffix != ".toml":
+        raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+    try:
+        table = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read ({error})") from None
+    except tomllib.TOMLDecodeError as error:
+        raise DataError(f"{path}: not valid TOML ({error})") from None
+    try:
+        return _parse_suite(table)
+    except (DesignError, DataError) as error:
+        raise DataError(f"{path}: {error}") from None
+
+
+def _parse_suite(table: Mapping[str, Any]) -> Suite:
+    keys(table, "the suite", ("schema", "name", "images", "patches", "camera", "scene", "condition"))
+    if table.get("schema") != SCHEMA:
+        raise DataError(f"schema is {table.get('schema')!r}, expected {SCHEMA!r}")
+    camera = keys(table.get("camera"), "camera", ("size_px", "lens_mm", "pixel_um"))
+    listed = {key: table.get(key) for key in ("patches", "condition")}
+    for key, value in listed.items():
+        if not isinstance(value, list) or not value:
+            raise DataError(f"{key} is {value!r}, expected a list")
+    scene = keys(table.get("scene"), "scene", tuple(SCENE_KEYS))
+    conditions = tuple(_parse_condition(entry, f"condition[{n}]") for n, entry in enumerate(table["condition"]))
+    names = [c.name for c in conditions]
+    if len(set(names)) < len(names):
+        raise DataError(f"two conditions share a name, among: {', '.join(names)}")
+    width, height = _numbers(camera.get("size_px"), "camera.size_px", (64, 16384), 2)
+    return Suite(
+        name=_text(table.get("name"), "name"),
+        images=int(number(table, "images", 1, 1e6)),
+        patches=tuple(find_patch(shipped_patches(), key) for key in table["patches"]),
+        size_px=(int(width), int(height)),
+        lens_mm=number(camera, "lens_mm", 0.01, 1e4, "camera."),
+        pixel_um=number(camera, "pixel_um", 0.01, 1e3, "camera."),
+        scene=tuple((key, _span(scene.get(key), f"scene.{key}", bounds)) for key, bounds in SCENE_KEYS.items()),
+        conditions=conditions,
+    )
+
+
+def _parse_condition(entry: object, place: str) -> Condition:
+    table = keys(entry, place, ("name", "unit", "rungs", "pose", "effects"))
+    rungs = _numbers(table.get("rungs"), f"{place}.rungs", (-1e6, 1e6))
+    pose = keys(table.get("pose", {}), f"{place}.pose", tuple(SCENE_KEYS))
+    effects = keys(table.get("effects", {}), f"{place}.effects", tuple(degrade.LADDER))
+
+    def levels(part: Mapping[str, Any], name: str, bounds: Mapping[str, tuple[float, float]]) -> Levels:
+        return tuple((k, _numbers(v, f"{place}.{name}.{k}", bounds[k], len(rungs))) for k, v in part.items())
+
+    return Condition(
+        name=_text(table.get("name"), f"{place}.name"),
+        unit=_text(table.get("unit"), f"{place}.unit"),
+        rungs=rungs,
+        pose=levels(pose, "pose", SCENE_KEYS),
+        effects=levels(effects, "effects", {name: rung.bounds for name, rung in degrade.LADDER.items()}),
+    )
+
+
+def _text(value: object, place: str) -> str:
+    if not isinstance(value, str) or not value:
+        raise DataError(f"{place} is {value!r}, expected a text")
+    return value
+
+
+def _numbers(value: object, place: str, bounds: tuple[float, float], count: int | None = None) -> tuple[float, ...]:
+    if not isinstance(value, list) or not value or (count is not None and len(value) != count):
+        raise DataError(f"{place} is {value!r}, expected a list of {'' if count is None else f'{count} '}numbers")
+    return tuple(number({place: v}, place, *bounds) for v in value)
+
+
+def _span(value: object, place: str, bounds: tuple[float, float]) -> tuple[float, float]:
+    """One number as (number, number), or [least, most]."""
+    least, most = _numbers(value if isinstance(value, list) else [value] * 2, place, bounds, 2)
+    if least > most:
+        raise DataError(f"{place} is {value!r}, expected [least, most]")
+    return least, most

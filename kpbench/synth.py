@@ -1,0 +1,121 @@
+"""A synthetic set: what its images are a function of, and how one is made."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpbench import degrade
+from kpbench.background import Background, PhotoFolder, procedural
+from kpbench.design import Patch, shipped_patches
+from kpbench.errors import DataError
+from kpbench.scene import Limits, measure_contrast, random_placements, render_scene, stream
+from kpbench.store import Sample
+
+__all__ = ["SynthConfig"]
+
+BACKGROUND, SCENE, DETERIORATION = range(3)
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """All that a synthetic set is a function of, besides the background files.
+
+    Attributes
+    ----------
+    n : number of images.
+    seed : any whole number from 0.
+    size_px : (width, height).
+    channels : 1 (grey) or 3 (RGB).
+    deteriorate : "none" or "paper" (:func:`kpbench.degrade.paper_mix`); the scenes are the same.
+    shard_size : images a shard; changes the files but no image.
+    backgrounds : folder of photographs, or None for procedural ones.
+    limits : what a scene may hold.
+    patches : the designs to place.
+
+    Raises
+    ------
+    DataError
+        If a value is out of its range.
+    """
+
+    n: int
+    seed: int = 0
+    size_px: tuple[int, int] = (640, 480)
+    channels: int = 1
+    deteriorate: str = "paper"
+    shard_size: int = 500
+    backgrounds: Path | None = None
+    limits: Limits = field(default_factory=Limits)
+    patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
+
+    def __post_init__(self) -> None:
+        def need(good: bool, what: str) -> None:
+            if not good:
+                raise DataError(what)
+
+        need(1 <= self.n <= 10**9, f"--n is {self.n}, expected a number of images from 1 to 1,000,000,000")
+        need(self.seed >= 0, f"--seed is {self.seed}, expected a whole number from 0")
+        need(min(self.size_px) >= 64, f"--size is {self.size_px[0]}x{self.size_px[1]}, expected at least 64x64")
+        need(max(self.size_px) <= 16384, f"--size is {self.size_px[0]}x{self.size_px[1]}, at most 16384 a side")
+        need(self.channels in (1, 3), f"--channels is {self.channels}, expected 1 or 3")
+        need(self.deteriorate in ("none", "paper"), f"--deteriorate is {self.deteriorate!r}, expected none or paper")
+        need(self.shard_size >= 1, f"--shard-size is {self.shard_size}, expected a number of images from 1")
+
+    @cached_property
+    def photos(self) -> PhotoFolder | None:
+        """The listed background folder."""
+        return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is written into the dataset: no path, so that a moved folder gives the same bytes."""
+        photos = self.photos
+        source: dict[str, Any] = {"kind": "procedural"}
+        if photos is not None:
+            source = {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
+        return {
+            "kind": "synth",
+            "n": self.n,
+            "seed": self.seed,
+            "size_px": list(self.size_px),
+            "channels": self.channels,
+            "deteriorate": self.deteriorate,
+            "shard_size": self.shard_size,
+            "backgrounds": source,
+            "limits": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.limits).items()},
+            "patches": [patch.to_dict() for patch in self.patches],
+        }
+
+    @property
+    def image_bytes(self) -> int:
+        """Expected size on disk: photographs deflate to about two thirds, noise hardly at all."""
+        width, height = self.size_px
+        return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
+
+    def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
+        """Image ``index`` of the set, and the broken background files met on the way.
+
+        A function of (self, index, background files) and of nothing else.
+        """
+        width, height = self.size_px
+        background = self._background(stream(self.seed, index, BACKGROUND))
+        placements = random_placements(stream(self.seed, index, SCENE), width, height, self.patches, self.limits)
+        scene = render_scene(background.image, placements)
+        image, effects = scene.image, list[dict[str, Any]]()
+        if self.deteriorate == "paper":
+            image, effects = degrade.paper_mix(image, stream(self.seed, index, DETERIORATION))
+            scene.keypoints["contrast"] = measure_contrast(image, scene.masks)
+        return Sample(index, image, scene.keypoints, effects, background.file), background.broken
+
+    def _background(self, rng: np.random.Generator) -> Background:
+        width, height = self.size_px
+        if self.photos is None:
+            return Background(procedural(rng, width, height, self.channels))
+        return self.photos.sample(rng, width, height, self.channels)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {key: value for key, value in self.__dict__.items() if key != "photos"}

@@ -1,0 +1,126 @@
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kpbench.cli import main
+from kpbench.pipeline import generate
+from kpbench.predictions import read_predictions
+from kpbench.synth import SynthConfig
+
+MODULE = """
+import numpy as np
+from kpbench import Detections
+
+def brightest(image):
+    grey = image if image.ndim == 2 else image.mean(axis=2)
+    y, x = np.unravel_index(int(grey.argmax()), grey.shape)
+    return Detections([[x, y], [0, 0]], [1.0, 0.2], [1, 0])
+
+def moody(image):
+    if int(image.sum()) % 2:
+        raise RuntimeError("not today")
+    return brightest(image)
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / f"plug_{abs(hash(str(tmp_path)))}.py").write_text(MODULE)
+    return tmp_path
+
+
+@pytest.fixture
+def plug(folder):
+    return next(folder.glob("plug_*.py")).stem
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, ["detect", *[str(a) for a in arguments]])
+
+
+def photos(folder, count=3):
+    (folder / "photos" / "sub").mkdir(parents=True)
+    for n in range(count):
+        image = np.zeros((60, 80, 3), np.uint8)
+        image[10 + n, 20] = 255
+        cv2.imwrite(str(folder / "photos" / ("sub" if n else "") / f"{n}.png"), image)
+
+
+def test_a_dataset_gets_predictions_that_name_it(folder, plug):
+    data = generate(SynthConfig(4, size_px=(160, 120)), "set", workers=1).dataset
+    result = run("set", "--detector", f"{plug}:brightest", "--workers", 1, "--overlay", "drawn")
+    assert result.exit_code == 0, result.output
+    assert "preds.json: 8 detections in 4 images" in result.stdout
+    found = read_predictions("preds.json")
+    assert found.dataset == "set"
+    assert found.image_id.tolist() == data.truth.image_id.tolist()
+    assert found.detector["name"] == f"{plug}:brightest"
+    assert len(list((folder / "drawn").iterdir())) == 4
+
+
+def test_workers_change_nothing(folder, plug):
+    generate(SynthConfig(40, size_px=(96, 96)), "set", workers=1)
+    for n in (1, 2):
+        assert run("set", "--detector", f"{plug}:brightest", "--workers", n, "--out", f"{n}.json").exit_code == 0
+    assert (folder / "1.json").read_bytes() == (folder / "2.json").read_bytes()
+
+
+def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
+    photos(folder)
+    result = run("photos", "--detector", f"{plug}:brightest", "--threshold", 0.5, "--overlay", "drawn")
+    assert result.exit_code == 0, result.output
+    assert read_predictions("preds.json").xy.tolist() == [[20, 10], [20, 11], [20, 12]]
+    assert sorted(p.relative_to(folder / "drawn").as_posix() for p in (folder / "drawn").rglob("*.png")) == [
+        "0.png",
+        "sub/1.png",
+        "sub/2.png",
+    ]
+
+
+def test_a_video_and_its_overlay(folder, plug):
+    writer = cv2.VideoWriter("in.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
+    for n in range(5):
+        frame = np.zeros((64, 96, 3), np.uint8)
+        cv2.rectangle(frame, (10 + 8 * n, 20), (20 + 8 * n, 30), (255, 255, 255), -1)
+        writer.write(frame)
+    writer.release()
+    result = run("in.mp4", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", "--threshold", 0.5)
+    assert result.exit_code == 0, result.output
+    x = read_predictions("preds.json").xy[:, 0]
+    assert len(x) == 5
+    assert (np.abs(x - (15 + 8 * np.arange(5))) <= 8).all()
+    assert cv2.VideoCapture("out.mp4").get(cv2.CAP_PROP_FRAME_COUNT) == 5
+
+
+def test_an_image_that_fails_is_named_and_counted_and_the_rest_goes_on(folder, plug):
+    photos(folder)
+    (folder / "photos" / "broken.jpg").write_bytes(b"nothing")
+    result = run("photos", "--detector", f"{plug}:moody")
+    assert result.exit_code == 1
+    assert "broken.jpg: cannot be decoded" in result.stderr
+    assert "0.png: RuntimeError: not today" in result.stderr
+    assert "4 images failed" in result.stderr
+    assert len(read_predictions("preds.json")) == 4
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        ("nowhere", "nowhere: no such dataset, image, folder or video"),
+        ("empty", "empty: neither a dataset nor a folder with images"),
+        ("text.png", "text.png: cannot be decoded as an image"),
+        ("text.mp4", "text.mp4: cannot be opened as a video"),
+        ("camera:x", "camera:x: expected camera:0"),
+    ],
+)
+def test_bad_sources_are_one_line(folder, plug, source, says):
+    (folder / "empty").mkdir()
+    (folder / "text.png").write_text("no image")
+    (folder / "text.mp4").write_text("no video")
+    result = run(source, "--detector", f"{plug}:brightest")
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"kpbench: {says}")
+    assert result.stderr.count("\n") == 1

@@ -1,0 +1,73 @@
+import json
+
+import cv2
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from kpbench.errors import DataError
+from kpbench.export import export, fold, to_onnx
+from kpbench.network import SuperPoint
+from kpbench.recipe import NetworkConfig, Phase, Recipe
+from kpbench.train import train
+
+SIZES = {"widths": (4, 4, 8, 8), "depths": (1, 2, 1, 1), "head_width": 8, "descriptor_width": 8}
+
+
+def lively(config):
+    """A network whose BatchNorms have something to fold."""
+    torch.manual_seed(1)
+    network = SuperPoint(config).train()
+    for _ in range(3):
+        network(torch.rand(2, 1, 32, 32))
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.weight, -1.0, 2.0)
+            torch.nn.init.uniform_(module.bias, -1.0, 1.0)
+    return network.eval()
+
+
+@pytest.mark.parametrize("norm", ["before", "after"])
+@pytest.mark.parametrize("down", ["max", "stride"])
+def test_onnx_gives_what_pytorch_gives_at_any_size(norm, down):
+    network = lively(NetworkConfig(norm=norm, down=down, **SIZES))
+    images = [torch.rand(b, 1, h, w) for b, h, w in ((1, 64, 64), (3, 8, 24), (1, 104, 72))]
+    with torch.inference_mode():
+        expected = [[part.numpy() for part in network(image)] for image in images]
+    session = onnxruntime.InferenceSession(to_onnx(fold(network), {}), providers=["CPUExecutionProvider"])
+    for image, wanted in zip(images, expected, strict=True):
+        got = session.run(None, {"image": image.numpy()})
+        for a, b in zip(got, wanted, strict=True):
+            assert a.dtype == np.float32
+            np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_folding_leaves_no_batchnorm_in_the_graph():
+    model = onnx.load_from_string(to_onnx(fold(lively(NetworkConfig(**SIZES))), {}))
+    kinds = {node.op_type for node in model.graph.node}
+    assert kinds <= {"Conv", "Relu", "MaxPool", "Identity"}
+
+
+def test_export_writes_the_mean_weights_and_says_what_they_are(tmp_path):
+    recipe = Recipe("tiny", (Phase(8),), network=NetworkConfig(**SIZES), batch=4)
+    (tmp_path / "photos").mkdir()
+    cv2.imwrite(str(tmp_path / "photos" / "a.png"), np.full((64, 64), 99, np.uint8))
+    assert train(recipe, tmp_path, tmp_path / "photos", workers=0, validation_images=1)
+    done = export(tmp_path / "checkpoint.safetensors", tmp_path / "tiny.onnx")
+    assert done.difference < 1e-4
+    assert done.step == 2
+    model = onnx.load(tmp_path / "tiny.onnx")
+    content = json.loads({p.key: p.value for p in model.metadata_props}["kpbench"])
+    assert content["name"] == "tiny"
+    assert content["samples"] == 8
+    assert [p["id"] for p in content["patches"]] == [0, 1, 2, 3]
+    assert content["recipe"]["network"]["widths"] == [4, 4, 8, 8]
+
+
+def test_a_file_that_is_no_checkpoint_is_one_line(tmp_path):
+    (tmp_path / "x.safetensors").write_bytes(b"nothing")
+    with pytest.raises(DataError, match=r"x\.safetensors: cannot be read as a checkpoint") as caught:
+        export(tmp_path / "x.safetensors", tmp_path / "x.onnx")
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,122 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from kpbench import samples
+from kpbench.design import shipped_patches
+from kpbench.geometry import projected_disc
+from kpbench.samples import Job, SampleConfig, load_photos, make_batch, random_poses, stream
+from kpbench.scene import Limits
+
+PATCHES = shipped_patches()
+CROPS = SampleConfig(size=(96, 96))
+PHOTOS = [np.random.default_rng(n).integers(0, 256, (60 + 90 * n, 200), np.uint8) for n in range(2)]
+
+
+def crops(index=0, count=8, severity=0.0, seed=0, config=CROPS):
+    return make_batch(config, PATCHES, PHOTOS, seed, index, count, severity)
+
+
+@pytest.mark.parametrize("kind", ["crops", "scenes"])
+def test_a_batch_is_a_function_of_seed_and_index(kind):
+    config = SampleConfig(kind, (320, 240), 5)
+    first, again = crops(3, config=config), crops(3, config=config)
+    assert np.array_equal(first.images, again.images)
+    assert np.array_equal(first.keypoints, again.keypoints)
+    for other in (crops(4, config=config), crops(3, seed=1, config=config)):
+        assert not np.array_equal(first.images, other.images)
+
+
+def test_scenes_repeat_after_the_set_and_degradations_do_not():
+    config = SampleConfig("scenes", (320, 240), 4)
+    clean = crops(0, 8, config=config)
+    assert np.array_equal(clean.images[:4], clean.images[4:])
+    worn = crops(0, 8, 1.0, config=config)
+    assert np.array_equal(worn.keypoints, clean.keypoints)
+    assert not np.array_equal(worn.images[:4], worn.images[4:])
+
+
+def test_severity_changes_the_image_but_no_position():
+    clean, worn = crops(1, 32), crops(1, 32, 1.0)
+    assert np.array_equal(clean.keypoints[:, 0, :3], worn.keypoints[:, 0, :3])
+    assert np.mean(clean.images != worn.images) > 0.5
+
+
+def test_keypoints_lie_inside_and_pad_rows_are_marked():
+    batch = crops(2, 64)
+    present = batch.keypoints[..., 2] >= 0
+    assert present.any()
+    assert (~present).any()
+    inside = (batch.keypoints[..., :2] >= -0.5) & (batch.keypoints[..., :2] < 95.5)
+    assert inside[present].all()
+    assert set(batch.keypoints[present][:, 2]) == {0.0, 1.0, 2.0, 3.0}
+
+
+def test_what_is_drawn_is_the_design_about_the_keypoint():
+    """Ink at points of the patch, looked up through the pose, against the pixels of the crop."""
+    canvas = np.full((96, 96), 128, np.uint8)
+    H = np.array([[30.0, -4.0, 40.3], [6.0, 22.0, 50.8], [0.05, -0.08, 1.0]])
+    disc = samples.Disc(PATCHES[3], 3, H, H[0, 2], H[1, 2], 32.0, 20.0, 10.0, 240.0)
+    samples._paint_all([canvas], [[disc]])
+    v, u = np.mgrid[-20:21, -20:21] / 21.0
+    points = np.column_stack([u.ravel(), v.ravel()])[np.hypot(u, v).ravel() < 0.9]
+    mapped = np.column_stack([points, np.ones(len(points))]) @ H.T
+    columns, rows = np.rint(mapped[:, :2] / mapped[:, 2:]).astype(int).T
+    black = PATCHES[3].is_black(points)
+    right = np.where(black, canvas[rows, columns] < 60, canvas[rows, columns] > 190)
+    assert right.mean() > 0.9  # all but pixels on edges
+    assert canvas[2, 2] == 128
+
+
+@given(st.integers(0, 2**31))
+def test_poses_keep_the_papers_limits(seed):
+    limits = Limits()
+    for H in random_poses(np.random.default_rng(seed), 5, limits):
+        assert H[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)
+        ellipse = projected_disc(H)
+        assert 2 * ellipse.minor >= limits.minor_axis_px - 1e-6
+        assert (ellipse.major - ellipse.minor) / ellipse.major <= limits.axis_difference + 1e-9
+
+
+def test_ellipses_are_those_of_the_geometry():
+    poses = random_poses(np.random.default_rng(0), 6, Limits())
+    centres, majors, minors = samples.ellipses(poses)
+    for n, H in enumerate(poses):
+        one = projected_disc(H)
+        assert (*centres[n], majors[n], minors[n]) == pytest.approx(
+            (one.x, one.y, one.major, one.minor), rel=1e-6, abs=1e-6
+        )
+
+
+def test_buried_keypoints_are_ignored_and_clean_ones_are_not(monkeypatch):
+    clean = crops(0, 64).keypoints
+    asked = clean[clean[..., 2] >= 0][:, 3] == 0
+    assert 0.8 < asked.mean() < 1.0  # patches of a board may be smaller than the limits
+    monkeypatch.setattr(samples, "_degrade", lambda image, *_: (image, 1.0, 0.0, 1e6))
+    batch = crops(0, 64)
+    present = batch.keypoints[..., 2] >= 0
+    assert (batch.keypoints[present][:, 3] > 4).all()
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_the_stream_keeps_the_order_of_its_jobs(workers, tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), PHOTOS[0])
+    jobs = [Job(n, 2, 0.5) for n in (5, 3, 9)]
+    got = list(stream(CROPS, PATCHES, tmp_path, 7, jobs, workers))
+    for job, batch in zip(jobs, got, strict=True):
+        assert np.array_equal(batch.images, make_batch(CROPS, PATCHES, PHOTOS[:1], 7, job.index, 2, 0.5).images)
+
+
+def test_every_tenth_photograph_is_kept_for_validation(tmp_path):
+    for n in range(21):
+        cv2.imwrite(str(tmp_path / f"{n:02}.png"), np.full((16, 16), n, np.uint8))
+    (tmp_path / "05.png").write_bytes(b"broken")
+    assert [int(p[0, 0]) for p in load_photos(tmp_path, "validation")] == [0, 10, 20]
+    assert [int(p[0, 0]) for p in load_photos(tmp_path, "training")] == [n for n in range(21) if n % 10 and n != 5]
+
+
+def test_large_photographs_are_kept_at_640_px(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 1280), np.uint8))
+    assert load_photos(tmp_path, "training")[0].shape == (50, 640)

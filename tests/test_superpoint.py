@@ -1,0 +1,171 @@
+import json
+
+import numpy as np
+import onnx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from onnx import TensorProto, helper
+
+from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells, to_grey
+from kpbench.errors import DataError
+
+
+def heads(points, h, w, ids=None, spread=0.0):
+    """Logits whose probability map has a keypoint, shared out bilinearly or as a Gaussian, at each point."""
+    image = np.full((8 * h, 8 * w), 1e-9)
+    rows, columns = np.mgrid[: 8 * h, : 8 * w]
+    for x, y in points:
+        if spread:
+            blob = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * spread**2))
+            image += blob / blob.sum()
+        else:
+            image += np.clip(1 - abs(columns - x), 0, 1) * np.clip(1 - abs(rows - y), 0, 1)
+    cells = image.reshape(h, 8, w, 8).transpose(1, 3, 0, 2).reshape(64, h, w)
+    detector = np.log(np.concatenate([cells, np.maximum(1 - cells.sum(0, keepdims=True), 1e-6)])).astype(np.float32)
+    identity = np.zeros((5, h, w), np.float32)
+    identity[4] = 5
+    for (x, y), patch in zip(points, ids if ids is not None else (), strict=False):
+        identity[patch, int(y) // 8, int(x) // 8] = 20
+    return detector, identity
+
+
+@given(st.floats(4, 59), st.floats(4, 43), st.floats(0, 1.2))
+def test_the_position_is_the_mean_of_the_distribution_across_cell_borders(x, y, spread):
+    found = decode(*heads([(x, y)], 6, 8, spread=spread if spread > 0.4 else 0.0))
+    assert len(found) == 1
+    # the window cuts the tails of a wide blob unevenly about a keypoint between two pixels
+    np.testing.assert_allclose(found.xy[0], (x, y), atol=1e-3 if spread <= 0.4 else 0.05)
+    assert found.score[0] > 0.9
+
+
+@pytest.mark.parametrize("place", [(15.5, 20.0), (16.0, 16.0), (15.5, 15.5), (23.75, 8.25), (0.0, 0.0), (63.0, 47.0)])
+def test_keypoints_on_cell_borders_and_at_the_corners_of_the_image_are_found_once(place):
+    found = decode(*heads([place], 6, 8, [3]))
+    np.testing.assert_allclose(found.xy, [place], atol=1e-4)
+    assert found.patch_id.tolist() == [3]
+
+
+def test_many_keypoints_keep_their_ids_and_come_best_first():
+    points = [(10.2, 10.7), (30.0, 12.5), (50.9, 33.1), (20.4, 40.0)]
+    detector, identity = heads(points, 6, 8, [0, 1, 2, 3])
+    detector[64, 1, 3] += 1.0  # the second is less sure
+    found = decode(detector, identity)
+    assert len(found) == 4
+    assert np.all(np.diff(found.score) <= 0)
+    nearest = [int(np.argmin(np.hypot(*(np.array(points) - p).T))) for p in found.xy]
+    assert found.patch_id.tolist() == nearest
+    assert nearest[-1] == 1
+
+
+def test_of_two_close_maxima_the_better_one_stays():
+    detector, identity = heads([(20.0, 20.0), (24.0, 20.0)], 6, 8)
+    assert len(decode(detector, identity, Decoding(threshold=0.1, separation_px=6))) == 1
+    assert len(decode(detector, identity, Decoding(threshold=0.1, separation_px=3, window_px=1))) == 2
+
+
+def test_nothing_is_found_where_nothing_is():
+    found = decode(*heads([], 6, 8))
+    assert len(found) == 0
+    assert found.patch_id is not None
+
+
+def test_colour_becomes_grey_and_other_arrays_are_refused():
+    colour = np.zeros((4, 6, 3), np.uint8)
+    colour[..., 0] = 255
+    assert to_grey(colour)[0, 0] == 76  # 0.299 of red
+    for wrong in (np.zeros((4, 6, 4), np.uint8), np.zeros((4, 6), np.float32), np.zeros(4, np.uint8)):
+        with pytest.raises(DataError, match="expected uint8"):
+            to_grey(wrong)
+
+
+@given(st.integers(1, 40), st.integers(1, 40))
+def test_padding_repeats_the_border_and_keeps_the_origin(height, width):
+    grey = np.random.default_rng(0).integers(0, 256, (height, width), np.uint8)
+    padded = pad_to_cells(grey)
+    assert padded.shape == (-(-height // 8) * 8, -(-width // 8) * 8)
+    assert np.array_equal(padded[:height, :width], grey)
+    assert np.all(padded[height:, :width] == grey[-1])
+
+
+def brightest_pixel_model(schema="kpbench.superpoint/1"):
+    """A graph without training: each pixel's logit is its brightness, "no keypoint" is constant."""
+    nodes = [
+        helper.make_node("SpaceToDepth", ["image"], ["cells"], blocksize=8),
+        helper.make_node("Mul", ["cells", "gain"], ["loud"]),
+        helper.make_node("ReduceSum", ["cells", "axis"], ["sum"], keepdims=1),
+        helper.make_node("Mul", ["sum", "zero"], ["flat"]),
+        helper.make_node("Add", ["flat", "level"], ["none"]),
+        helper.make_node("Concat", ["loud", "none"], ["detector"], axis=1),
+        helper.make_node("Concat", ["flat", "none", "flat"], ["identity"], axis=1),
+    ]
+    constants = [
+        helper.make_tensor("gain", TensorProto.FLOAT, [1], [40.0]),
+        helper.make_tensor("zero", TensorProto.FLOAT, [1], [0.0]),
+        helper.make_tensor("level", TensorProto.FLOAT, [1], [20.0]),
+        helper.make_tensor("axis", TensorProto.INT64, [1], [1]),
+    ]
+    sides = ["b", 1, "h", "w"]
+    graph = helper.make_graph(
+        nodes,
+        "brightest",
+        [helper.make_tensor_value_info("image", TensorProto.FLOAT, sides)],
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, ["b", "c", "h2", "w2"])
+            for name in ("detector", "identity")
+        ],
+        constants,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    content = {"schema": schema, "name": "brightest", "patches": [{"id": 5}, {"id": 7}]}
+    helper.set_model_props(model, {"kpbench": json.dumps(content)})
+    onnx.checker.check_model(model)
+    return model.SerializeToString()
+
+
+@pytest.fixture
+def detector(tmp_path):
+    path = tmp_path / "brightest.onnx"
+    path.write_bytes(brightest_pixel_model())
+    return SuperPointDetector(path, threads=1)
+
+
+@pytest.mark.parametrize("shape", [(40, 48), (41, 51), (9, 17), (40, 48, 3)])
+def test_any_size_and_mode_is_accepted_and_ids_are_those_of_the_designs(detector, shape):
+    image = np.zeros(shape, np.uint8)
+    image[5, 13] = 255
+    found = detector(image)
+    np.testing.assert_allclose(found.xy, [(13, 5)], atol=1e-3)
+    assert found.patch_id.tolist() == [7]
+
+
+def test_what_lies_in_the_padding_is_no_detection(detector):
+    image = np.zeros((9, 17), np.uint8)
+    image[8, 16] = 255  # repeated over the padding, the last pixel becomes a bright square
+    found = detector(image)
+    assert np.all(found.xy < (16.5, 8.5))
+
+
+def test_refinement_gets_the_grey_image_and_has_the_last_word(detector):
+    detector.refine = lambda grey, found: (grey.shape, len(found))
+    assert detector(np.zeros((16, 24, 3), np.uint8)) == ((16, 24), 0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"no model", r"weights\.onnx: cannot be read as an ONNX model"),
+        (brightest_pixel_model("other/1"), r"weights\.onnx: not written by kpbench export-model"),
+    ],
+)
+def test_a_file_that_is_no_model_of_ours_is_one_line(tmp_path, content, message):
+    path = tmp_path / "weights.onnx"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        SuperPointDetector(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere\.onnx: cannot be read"):
+        SuperPointDetector(tmp_path / "nowhere.onnx")
