@@ -366,7 +366,8 @@ class Scores:
         the condition and rung, and for each over all images.
     confusion : dict
         ``ids`` (true ones, sorted) and ``matrix``: a row a true id, a column a detected id of a matched
-        detection, and a last column for ids that no true keypoint has or that are contradicted. Empty without identities.
+        detection, and a last column for ids that no true keypoint has or that are contradicted. Empty
+        without identities.
     curve : dict
         ``score``, ``precision``, ``recall`` and ``average_false_alarm`` when only detections of at least that
         score are kept, from the surest on; at most 201 points.

@@ -7,3 +7,40 @@ from pathlib import Path
 import click
 
 __all__ = ["demo"]
+
+
+@click.command()
+@click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-demo"), show_default=True)
+@click.option("--n", type=click.IntRange(1, 100_000), default=100, show_default=True, help="Number of images.")
+@click.option("--detector", default="template", show_default=True)
+@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.pass_context
+def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path | None) -> None:
+    """Print, synthesise, detect and score: the whole chain, small, in about a minute.
+
+    \b
+    Example:
+      kpbench demo
+    """
+    from kpbench.cli import main
+
+    data, preds = out / "data", out / "preds.json"
+    photographs = ["--backgrounds", str(backgrounds)] if backgrounds else []
+    steps = [
+        ("print the patches", ["render-patches", "--pdf", "--png", "--dpi", "150", "--out", str(out / "print")]),
+        ("synthesise images", ["synth", "--n", str(n), "--out", str(data), "--overwrite", *photographs]),
+        ("draw a contact sheet", ["preview", str(data), "--out", str(out / "contact-sheet.png")]),
+        ("detect", ["detect", str(data), "--detector", detector, "--out", str(preds)]),
+        ("score", ["score", str(preds), "--json", str(out / "scores.json")]),
+    ]
+    for title, arguments in steps:
+        click.secho(f"\n{title}: kpbench {' '.join(arguments)}", bold=True)
+        with main.make_context("kpbench", arguments, parent=ctx.parent) as step:
+            main.invoke(step)
+    click.secho("\nOpen:", bold=True)
+    for name, what in (
+        ("print/patches.pdf", "the print sheet"),
+        ("contact-sheet.png", "images with their true keypoints"),
+        ("scores.json", "the scores, all of them"),
+    ):
+        click.echo(f"  {out / name}  {what}")
