@@ -62,9 +62,7 @@ def main() -> None:
     suite = load_suite("paper-v1")
     plain, bent = (SuiteConfig(suite, scenes, only=("scale", "pitch"), distortion=d) for d in ((), LENS))
     black = np.zeros((plain.camera.height_px, plain.camera.width_px), np.uint8)
-    print(
-        "| condition | rung | area counted % | worst deviation % | size px | points px | axes px | bent: points | axes |"
-    )
+    print("| condition | rung | area counted % | worst % | size px | points px | axes px | bent: points | axes |")
     print("|---|---|---|---|---|---|---|---|---|")
     for rung, (condition, step) in enumerate(plain.rungs):
         areas, sizes, worst = [], [], np.zeros(4)

@@ -35,6 +35,7 @@ from kpbench.geometry import Camera, plane_to_camera, projected_disc, rotation_x
 from kpbench.keypoints import Float, UInt8
 
 __all__ = [
+    "PAIR_STEPS",
     "STEPS",
     "Analysis",
     "Bound",
@@ -59,6 +60,8 @@ SEEN_IDENTITY = (1.0, 3 / 4)
 SHIFT = 0.25  # of the seen radius
 LOOKS_ALIKE = (0.8, 0.9)  # correlations
 WINDOWS = 20_000
+PAIR_STEPS = len(SEEN_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(DIRECTIONS_DEG))  # calls of progress
+STEPS = len(SIZES_PX) * len(TILTS_DEG) * 2 + PAIR_STEPS
 
 
 # --- Localisation -------------------------------------------------------------------------------------
@@ -472,9 +475,6 @@ def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], Non
         for p, turned, black, pixels, found, hidden, bound_to_centre, sharp, blurred in measures
     )
     return Analysis(reports, correlation, distance)
-
-
-STEPS = len(SIZES_PX) * len(TILTS_DEG) * 2 + len(SEEN_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(DIRECTIONS_DEG))
 
 
 def _black_fraction(grid: Grid, inks: Float32) -> Float:

@@ -7,7 +7,7 @@ aliased. See :mod:`kpbench.geometry` for the frames.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from kpbench.board import Board
 from kpbench.design import unit_polygons
 from kpbench.errors import DataError
-from kpbench.geometry import Camera, Ellipse, plane_to_camera, project, projected_disc, rotation_xyz
+from kpbench.geometry import NO_DISTORTION, Camera, Ellipse, plane_to_camera, project, projected_disc, rotation_xyz
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
 from kpbench.outline import flatten, rectangle
 from kpbench.raster import Box, box_around, coverage
@@ -31,6 +31,7 @@ MARGIN = 0.01  # of the image's width, kept free around the board
 SHADOW_REACH = 0.4  # board sides that the shadow is moved for a slope of 1
 SHADOW_SOFT = 0.05  # standard deviation of its edge, board sides
 SHADOW_GRID = 64  # a board side in pixels of the grid on which the shadow is made, before it is enlarged
+MOST_PIECES = 400  # of one straight edge
 PIECE_PX = 8.0  # longest straight piece of a projected outline where the lens bends lines
 
 
@@ -94,7 +95,7 @@ def _bent(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
         return to_px(camera, pose, polygon_mm)
     following = np.roll(polygon_mm, -1, axis=0)
     length_px = np.linalg.norm(to_px(camera, pose, following) - to_px(camera, pose, polygon_mm), axis=1)
-    pieces = np.maximum(1, np.ceil(length_px / PIECE_PX)).astype(int)
+    pieces = np.clip(np.ceil(length_px / PIECE_PX), 1, MOST_PIECES).astype(int)
     which = np.repeat(np.arange(len(pieces)), pieces)
     part = (np.arange(len(which)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[which]
     return to_px(camera, pose, polygon_mm[which] + part[:, None] * (following - polygon_mm)[which])
@@ -148,15 +149,20 @@ def pose_board(
 def _depth(camera: Camera, board: Board, R: Float, ray: Float, area_px: float) -> float:
     """Distance along the optical axis, mm, at which the board's image has an area."""
 
-    def excess(log_depth: float) -> float:
-        pose = Pose(R, np.exp(log_depth) * ray)
-        return float(np.log(polygon_area(outline_px(camera, pose, board)) / area_px))
+    def solve(lens: Camera, near: float, far: float) -> float:
+        def excess(log_depth: float) -> float:
+            edge = outline_px(lens, Pose(R, np.exp(log_depth) * ray), board)
+            return float(np.log(polygon_area(edge) / area_px))
+
+        return float(np.exp(brentq(excess, np.log(near), np.log(far), xtol=1e-13)))
 
     corners = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * (board.side_x_mm, board.side_y_mm, 0)
     frontal = camera.focal_px * np.sqrt(board.side_x_mm * board.side_y_mm / area_px)
     nearest = max(-(corners @ R.T)[:, 2].min() * 1.001, 0.05 * frontal)
     try:
-        return float(np.exp(brentq(excess, np.log(nearest), np.log(4 * frontal), xtol=1e-13)))
+        depth = solve(replace(camera, distortion=NO_DISTORTION), nearest, 4 * frontal)
+        # a lens polynomial means something in and near the image only, so the search stays near the pinhole's answer
+        return solve(camera, max(nearest, 0.7 * depth), 1.5 * depth) if any(camera.distortion) else depth
     except ValueError:
         raise DataError(f"no distance gives a board an image of {area_px:.0f} px at this tilt and lens") from None
 

@@ -95,6 +95,9 @@ def plane_to_camera(R_plane2camera: Float, t_camera: ArrayLike) -> Float:
     return np.column_stack([R_plane2camera[:, :2], np.asarray(t_camera, np.float64)])
 
 
+NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Camera:
     """A camera: image size and focal length in px, principal point at the image's centre.
@@ -105,7 +108,7 @@ class Camera:
     width_px: int
     height_px: int
     focal_px: float
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
 
     @property
     def K(self) -> Float:

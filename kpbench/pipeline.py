@@ -166,9 +166,16 @@ def _check_space(folder: Path, image_bytes: int, images: int) -> None:
     need = images * image_bytes
     free = shutil.disk_usage(folder).free
     if need > free:
-        raise DataError(
-            f"{folder}: {images} images need about {need / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB free"
-        )
+        raise DataError(f"{folder}: {images} images need about {_size(need)}, the disk has {_size(free)} free")
+
+
+def _size(count: float) -> str:
+    """Bytes for people: 12.3 MB."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if count < 1000 or unit == "TB":
+            break
+        count /= 1000
+    return f"{count:.3g} {unit}"
 
 
 @contextmanager

@@ -5,8 +5,9 @@ painted black, white or inverting on a black or white disc. Rotations and mirror
 as one. Its cells are four rings by eight sectors, hence a design is a code of 32 bits.
 
 The rule: keep the designs whose centre is a crossing of straight edges, whose smallest region holds a
-2-px circle at 4 px radius, whose centre is bound at least twice as well as that of a corner (basin at
-least 0.10), whose bound holds without the rim, and which at most one place in 500 of an image looks like.
+2-px circle at 4 px radius, whose centre is bound more than twice as well as that of a corner (basin at
+least 0.10, a corner's is 0.041), whose bound without the rim is at most 0.05 px at 5 px radius, and which
+at most one place in 500 of an image looks like.
 Of all sets of four of them take the one whose closest two designs are farthest apart; of equal sets the
 one whose next closest two are.
 """
@@ -22,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.analysis import (
+    PAIR_STEPS,
     SIZES_PX,
     basin,
     correlation_and_distance,
@@ -45,7 +47,7 @@ LEAST_BASIN = 0.10
 MOST_BOUND_PX = 0.05  # at 5 px radius, without the rim
 MOST_NATURAL = 1 / 500  # of all places with a correlation over 0.8
 SET_SIZE = 4
-STEPS = 6  # calls of progress, besides those of analysis.correlation_and_distance
+STEPS = 6 + PAIR_STEPS  # calls of progress
 
 Codes = NDArray[np.uint32]
 
@@ -245,7 +247,7 @@ def search(
     count : int
         How many sets to give.
     progress : callable
-        Called now and then.
+        Called now and then, :data:`STEPS` times in all.
     """
     family = enumerate_family()
     codes = family.classes

@@ -181,8 +181,10 @@ def test_natural_response_finds_the_design_itself_and_no_flat_place():
     names = ["checker", "wheel"]
     windows = np.stack([painted(NAMED["checker"]), painted(NAMED["wheel"]), np.full((21, 21), 99, np.uint8)])
     for blur in (0.0, analysis.BLUR):
-        windows_of = [measured(names, analysis.natural_response, windows=w[None], blur=blur) for w in windows]
-        np.testing.assert_array_equal([w[:, 1] for w in windows_of], [[1, 0], [0, 1], [0, 0]])
+        response = measured(names, analysis.natural_response, windows=windows, blur=blur)
+        np.testing.assert_allclose(response[:, 1], 1 / 3)
+    response = measured(names, analysis.natural_response, windows=windows[1:2])
+    np.testing.assert_array_equal(response[:, 1], [0, 1])
 
 
 def test_windows_come_from_the_images_and_are_repeatable():

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells, to_grey
+from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells
 from kpbench.errors import DataError
 
 
@@ -68,15 +68,6 @@ def test_nothing_is_found_where_nothing_is():
     found = decode(*heads([], 6, 8))
     assert len(found) == 0
     assert found.patch_id is not None
-
-
-def test_colour_becomes_grey_and_other_arrays_are_refused():
-    colour = np.zeros((4, 6, 3), np.uint8)
-    colour[..., 0] = 255
-    assert to_grey(colour)[0, 0] == 76  # 0.299 of red
-    for wrong in (np.zeros((4, 6, 4), np.uint8), np.zeros((4, 6), np.float32), np.zeros(4, np.uint8)):
-        with pytest.raises(DataError, match="expected uint8"):
-            to_grey(wrong)
 
 
 @given(st.integers(1, 40), st.integers(1, 40))

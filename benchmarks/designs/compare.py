@@ -79,7 +79,6 @@ def family_measures(windows):
 def limits_table(windows):
     print("\nBest set under other limits (needs px, basin, natural, natural blurred): closest two, set")
     codes, pixels, bound_to_centre, natural, blurred, distance = family_measures(windows)
-    family = search.enumerate_family()
     names = {search.code_of(p): p.name for p in shipped_patches()}
     limits = [(4.0, 0.10, 1 / 500, 1.0)]
     limits += [(p, 0.10, 1 / 500, 1.0) for p in (3.7, 4.5, 5.0)]
@@ -101,7 +100,6 @@ def limits_table(windows):
             f"{closest:.3f}",
             *(names.get(int(c), f"{int(c):08x}") for c in codes[members]),
         )
-    return family
 
 
 def write_runner_up(windows):

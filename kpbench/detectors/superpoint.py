@@ -17,10 +17,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
 
-__all__ = ["Decoding", "SuperPointDetector", "decode", "open_session", "pad_to_cells", "to_grey"]
+__all__ = ["Decoding", "SuperPointDetector", "decode", "open_session", "pad_to_cells"]
 
 CELL = 8
 SCHEMA = "kpbench.superpoint/1"
@@ -83,10 +84,9 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
     y = rows + windows.sum(axis=2) @ (offset - reach) / total
     xy = np.column_stack([x, y])
     score = np.minimum(total, 1.0).astype(np.float64)
-    order = np.lexsort((x, y, -score))
-    order = order[_apart(xy[order], how.separation_px)]
-    ids = np.argmax(_at(id_logits, xy[order])[:, :-1], axis=1)
-    return Detections(xy[order], score[order], ids)
+    kept = suppress(xy, score, how.separation_px)
+    ids = np.argmax(_at(id_logits, xy[kept])[:, :-1], axis=1)
+    return Detections(xy[kept], score[kept], ids)
 
 
 def keypoint_probability(detector_logits: Float32) -> Float32:
@@ -95,15 +95,6 @@ def keypoint_probability(detector_logits: Float32) -> Float32:
     share = np.exp(detector_logits - detector_logits.max(axis=0))
     share = share[:-1] / share.sum(axis=0)
     return np.ascontiguousarray(share.reshape(CELL, CELL, h, w).transpose(2, 0, 3, 1).reshape(CELL * h, CELL * w))
-
-
-def _apart(xy: Float, distance: float) -> NDArray[np.int64]:
-    """Indices of the points that have no better (earlier) kept one within ``distance``."""
-    kept: list[int] = []
-    for n, point in enumerate(xy):
-        if not kept or np.min(np.hypot(*(xy[kept] - point).T)) >= distance:
-            kept.append(n)
-    return np.array(kept, np.int64)
 
 
 def _at(cells: Float32, xy: Float) -> Float:
@@ -116,19 +107,6 @@ def _at(cells: Float32, xy: Float) -> Float:
     top = cells[:, i, j] * (1 - fx) + cells[:, i, j1] * fx
     bottom = cells[:, i1, j] * (1 - fx) + cells[:, i1, j1] * fx
     return np.asarray((top * (1 - fy) + bottom * fy).T)
-
-
-def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or RGB (H, W, 3) to (H, W).
-
-    Raises
-    ------
-    DataError
-        If the array is no such image.
-    """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def pad_to_cells(grey: UInt8) -> UInt8:
