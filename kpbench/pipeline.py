@@ -286,7 +286,7 @@ def predict(
             for n in range(len(dataset)):
                 draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
     labels = [f"image_id {image_id}" for image_id in ids]
-    return _predicted(loaded, [found[n] for n in range(len(dataset))], labels, ids, str(dataset.path))
+    return _predicted(loaded, [found[n] for n in range(len(dataset))], labels, ids, dataset)
 
 
 def predict_images(
@@ -313,14 +313,19 @@ def predict_images(
             if image is not None:
                 draw(label, draw_detections(image, found[-1][0]))
             progress(1)
-    return _predicted(loaded, found, labels, np.arange(len(found)), None)
+    return _predicted(loaded, found, labels, np.arange(len(found)))
 
 
 def _predicted(
-    detector: LoadedDetector, found: list[Found], labels: list[str], ids: NDArray[np.int64], dataset: str | None
+    detector: LoadedDetector,
+    found: list[Found],
+    labels: list[str],
+    ids: NDArray[np.int64],
+    dataset: store.Dataset | None = None,
 ) -> Predicted:
     about = {"name": detector.name, "version": detector.version}
-    predictions = Predictions.from_detections([d for d, _ in found], ids, about, dataset)
+    where = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
+    predictions = Predictions.from_detections([d for d, _ in found], ids, about, **where)
     return Predicted(predictions, tuple((label, said) for label, (_, said) in zip(labels, found, strict=True) if said))
 
 

@@ -31,7 +31,7 @@ from kpbench.keypoints import Detections, Float
 __all__ = ["Predictions", "read_predictions", "write_predictions"]
 
 SCHEMA = "kpbench.predictions/1"
-HEADER_KEYS = {"schema", "dataset", "detector"}
+HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 RECORD_KEYS = {"image_id", "keypoints", "scores", "ids"}
 COLUMNS = ("image_id", "x", "y", "score", "id")
 
@@ -61,6 +61,8 @@ class Predictions:
         Whatever names the detector, such as ``{"name": "superpoint", "version": "1"}``.
     dataset : str or None
         Path or fingerprint of the dataset.
+    fingerprint : str or None
+        Fingerprint of the dataset, checked when scoring.
 
     Raises
     ------
@@ -75,6 +77,7 @@ class Predictions:
     patch_id: Int | None = None
     detector: dict[str, Any] = field(default_factory=dict)
     dataset: str | None = None
+    fingerprint: str | None = None
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
@@ -96,6 +99,7 @@ class Predictions:
         image_id: Sequence[int] | Int | None = None,
         detector: dict[str, Any] | None = None,
         dataset: str | None = None,
+        fingerprint: str | None = None,
     ) -> Predictions:
         """One :class:`Detections` an image, to columns; ``image_id`` is 0, 1, 2, … where it is not given.
 
@@ -117,6 +121,7 @@ class Predictions:
             patch_id=np.concatenate([np.zeros(0, np.int64), *ids]) if all(named) else None,
             detector=detector or {},
             dataset=dataset,
+            fingerprint=fingerprint,
         )
 
     def detections(self) -> list[Detections]:
@@ -233,7 +238,7 @@ def _parse(data: bytes, place: str) -> Any:
 
 
 def _header(content: Any) -> dict[str, Any]:
-    """Check the part that all formats share; gives the keyword arguments ``detector`` and ``dataset``."""
+    """Check the part that all formats share; gives the keyword arguments ``detector``, ``dataset`` and ``fingerprint``."""
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         found = repr(content["schema"]) if isinstance(content, dict) and "schema" in content else "missing"
         raise PredictionsError(f"schema is {found}, expected {SCHEMA!r}")
@@ -244,7 +249,10 @@ def _header(content: Any) -> dict[str, Any]:
         raise PredictionsError(f"detector is {_kind(detector)}, expected an object")
     if not isinstance(dataset, str | None):
         raise PredictionsError(f"dataset is {_kind(dataset)}, expected a path or a fingerprint")
-    return {"detector": detector, "dataset": dataset}
+    fingerprint = content.get("fingerprint")
+    if not isinstance(fingerprint, str | None):
+        raise PredictionsError(f"fingerprint is {_kind(fingerprint)}, expected that of a dataset")
+    return {"detector": detector, "dataset": dataset, "fingerprint": fingerprint}
 
 
 def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
@@ -552,8 +560,8 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
 
 
 def _header_of(p: Predictions) -> dict[str, Any]:
-    dataset = {} if p.dataset is None else {"dataset": p.dataset}
-    return {"schema": SCHEMA, **dataset, "detector": p.detector}
+    named = {"dataset": p.dataset, "fingerprint": p.fingerprint}
+    return {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": p.detector}
 
 
 def _lines(p: Predictions) -> Iterable[bytes]:

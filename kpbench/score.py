@@ -787,7 +787,7 @@ def evaluate(
 
 def _image_of_detections(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
     """Position in the truth of each detection's image, after checking that both are of the same images."""
-    named = predictions.dataset or ""
+    named = predictions.fingerprint or predictions.dataset or ""
     if re.fullmatch("[0-9a-f]{64}", named) and truth.fingerprint and named != truth.fingerprint:
         raise PredictionsError(
             f"made for the dataset with fingerprint {named[:12]}…, but this dataset's is {truth.fingerprint[:12]}…"

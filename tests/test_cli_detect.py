@@ -124,3 +124,14 @@ def test_bad_sources_are_one_line(folder, plug, source, says):
     assert result.exit_code == 1
     assert result.stderr.startswith(f"kpbench: {says}")
     assert result.stderr.count("\n") == 1
+
+
+def test_predictions_for_another_dataset_are_refused_by_its_fingerprint(folder, plug):
+    for seed in (0, 1):
+        generate(SynthConfig(4, seed=seed, size_px=(160, 120)), f"set-{seed}", workers=1)
+    assert run("set-0", "--detector", f"{plug}:brightest", "--workers", 1).exit_code == 0
+    assert CliRunner().invoke(main, ["score", "preds.json"]).exit_code == 0
+    refused = CliRunner().invoke(main, ["score", "preds.json", "--gt", "set-1"])
+    assert refused.exit_code == 1
+    assert "made for the dataset with fingerprint" in refused.stderr
+    assert refused.stderr.count("\n") == 1
