@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade, store
-from kpbench.background import PhotoFolder
 from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, UInt8
@@ -30,7 +29,7 @@ from kpbench.scene import stream
 from kpbench.sources import Source, image_writer
 from kpbench.workers import Progress, run_pieces
 
-__all__ = ["Predicted", "Recipe", "degrade_files", "generate", "image_files", "predict", "predict_images"]
+__all__ = ["Predicted", "Recipe", "degrade_files", "generate", "predict", "predict_images"]
 
 
 class Recipe(Protocol):
@@ -353,33 +352,17 @@ def _detect_some(
     return results
 
 
-def image_files(source: Path) -> PhotoFolder:
-    """An image file or a folder of them.
-
-    Raises
-    ------
-    DataError
-        If it is not there, or no image in it can be decoded.
-    """
-    if source.is_dir():
-        return PhotoFolder.open(source)
-    photos = PhotoFolder(source.parent, (source.name,))
-    if photos.decode(source.name, 3) is None:
-        raise DataError(f"{source}: {'cannot be decoded as an image' if source.exists() else 'no such file or folder'}")
-    return photos
-
-
 def degrade_files(
-    photos: PhotoFolder, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
+    source: Source, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
 ) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     """Degrade images one by one and write them as PNG under their own names, with the folders they are in.
 
     Parameters
     ----------
-    photos : from :func:`image_files`; those that cannot be decoded are passed over.
+    source : from :func:`kpbench.sources.open_images`; what cannot be decoded is passed over.
     out : folder; made if it is not there.
     steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
-    seed : the n-th file is a function of its image, the steps, the seed and n.
+    seed : the n-th image written is a function of the n-th image, the steps, the seed and n.
 
     Yields
     ------
@@ -391,8 +374,7 @@ def degrade_files(
     DataError
         If an effect is not known, a level is out of range, or a file cannot be written.
     """
-    for n, name in enumerate(photos.files):
-        image = photos.decode(name, 3)
+    for n, (name, image) in enumerate(source.images):
         if image is None:
             continue
         if (image == image[..., :1]).all():  # grey, whatever the file's mode

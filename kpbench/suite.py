@@ -26,7 +26,7 @@ from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.geometry import Camera
-from kpbench.scene import measure_contrast
+from kpbench.scene import measure_contrast, stream
 
 __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "load_suite", "shipped_suites"]
 
@@ -214,7 +214,7 @@ class SuiteConfig:
         rest, scene = divmod(index, self.scenes)
         rung, patch = divmod(rest, len(self.suite.patches))
         condition, step = self.rungs[rung]
-        rng = _stream(self.seed, scene, SCENE)
+        rng = stream(self.seed, scene, SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
         tilt = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
@@ -225,7 +225,7 @@ class SuiteConfig:
         look = Look(drawn["black"], drawn["white"], drawn["edge"], drawn["light"], slope, drawn["shadow"])
         keypoints = board_keypoints(self.camera, pose, board)
         discs = np.column_stack([keypoints["x"], keypoints["y"], keypoints["radius_major"].astype(np.float64)])
-        rng = _stream(self.seed, scene, EFFECT)
+        rng = stream(self.seed, scene, EFFECT)
         size = (self.camera.width_px, self.camera.height_px)
         effects = [degrade.climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
         return Shot(condition.name, condition.rungs[step], scene, board, pose, look, effects, keypoints)
@@ -235,7 +235,7 @@ class SuiteConfig:
         shot = self.shot(index)
         background = self._background(shot.scene)
         clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
-        image = degrade.apply(clean.image, _stream(self.seed, shot.scene, FIELD), shot.effects)
+        image = degrade.apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
         keypoints = clean.keypoints
         for effect in shot.effects:
             if effect["effect"] == "occlusion":
@@ -251,7 +251,7 @@ class SuiteConfig:
         """The background of a scene; the first ones that fit are kept, as every scene comes back under each rung."""
         if scene in self._kept:
             return self._kept[scene]
-        rng, (width, height) = _stream(self.seed, scene, BACKGROUND), (self.camera.width_px, self.camera.height_px)
+        rng, (width, height) = stream(self.seed, scene, BACKGROUND), (self.camera.width_px, self.camera.height_px)
         if self.photos is None:
             background = Background(procedural(rng, width, height))
         else:
@@ -259,10 +259,6 @@ class SuiteConfig:
         if len(self._kept) < KEPT_BYTES // background.image.nbytes:
             self._kept[scene] = background
         return background
-
-
-def _stream(seed: int, scene: int, stage: int) -> np.random.Generator:
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(scene, stage))))
 
 
 @lru_cache(maxsize=64)

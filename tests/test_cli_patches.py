@@ -8,7 +8,6 @@ import pikepdf
 import pytest
 from click.testing import CliRunner
 
-import kpbench
 from kpbench.cli import main
 from kpbench.design import shipped_patches
 
@@ -150,24 +149,6 @@ def test_two_designs_of_one_name_do_not_overwrite_each_other():
     assert result.exit_code == 1
     assert "two boards would be written to hexagon-same" in result.stderr
     assert not Path("patches-print").exists()
-
-
-def test_the_documentation_runs():
-    text = (Path(kpbench.__file__).parent.parent / "docs" / "printing.md").read_text("utf-8")
-    blocks = {kind: re.findall(rf"```{kind}\n(.*?)```", text, re.S) for kind in ("sh", "toml", "python")}
-    whole, grid = blocks["toml"]
-    Path("mixed.toml").write_text(whole)
-    commands = [line.split() for block in blocks["sh"] for line in block.splitlines()]
-    assert len(commands) >= 6
-    for program, command, *arguments in commands:
-        assert (program, command) == ("kpbench", "render-patches")
-        done(*arguments)
-    Path("grid.toml").write_text(grid)
-    _, sidecar = done("--board", "grid.toml", "--diameter-mm", 12)
-    assert len(load(sidecar)["keypoints"]) == 35
-    names = {}
-    exec(blocks["python"][0], names)
-    assert names["object_points"].shape == (6, 3)
 
 
 @pytest.mark.skipif(not shutil.which("pdfinfo"), reason="needs poppler")

@@ -14,34 +14,24 @@ PACKAGE = Path(kpbench.__file__).parent
 # Each module may import those of its own line and of the lines before it.
 LAYERS = [
     {"errors", "keypoints"},
-    {"geometry", "outline", "raster"},
+    {"geometry", "outline", "raster", "workers"},
     {"design"},
-    {"background", "board", "draw", "sheet", "sidecar", "tiling"},
-    {"scene", "degrade", "cells", "analysis", "search", "design_figure"},
-    {"samples", "camera"},
-    {"recipe"},
-    {"store", "predictions"},
+    {"background", "board", "cells", "draw", "sidecar", "tiling"},
+    {"sheet", "analysis", "search", "design_figure"},
+    {"scene", "degrade"},
+    {"camera"},
+    {"store", "predictions", "sources"},
+    {"synth", "suite", "samples", "recipe"},
     {"refine"},
     {"detect"},
     {"score"},
     {"report", "preview", "interchange"},
     {"pipeline"},
 ]
-EVALUATOR = {"score", "predictions", "report", "detect", "store"}
+EVALUATOR = {"score", "predictions", "report", "detect", "store", "sources", "preview", "interchange"}
 GENERATOR = {
-    "design",
-    "scene",
-    "degrade",
-    "background",
-    "board",
-    "draw",
-    "sheet",
-    "tiling",
-    "cells",
-    "analysis",
-    "search",
-    "design_figure",
-    "samples",
+    *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
+    *("background", "scene", "degrade", "camera", "synth", "suite", "samples"),
 }
 TORCH = {"network", "train", "export"}
 

@@ -342,6 +342,28 @@ def test_equal_scores_do_not_let_the_order_choose():
         assert scores["id_matching_score"] == 1
 
 
+def test_equal_scores_and_distances_are_decided_by_place():
+    rows = [(11, 10, 0.5, 1), (10, 11, 0.5, 0), (9, 10, 0.5, 2), (10, 9, 0.5, 3)]
+    for order in itertools.permutations(rows):
+        assert run(truth_of([[(10, 10, 50, 2)]]), [found(*order)])["id_matching_score"] == 1  # lowest x
+    # two keypoints, two detections, both assignments worth the same
+    keypoints, pair = [(0, 0, 50, 0), (4, 0, 50, 1)], [(2, 1, 0.5, 0), (2, -1, 0.5, 1)]
+    results = {
+        run(truth_of([list(k)]), [found(*d)])["id_matching_score"]
+        for k, d in itertools.product(itertools.permutations(keypoints), itertools.permutations(pair))
+    }
+    assert len(results) == 1
+
+
+def test_where_keypoints_share_detections_the_surest_ones_are_matched():
+    keypoints = [(0, 0, 40, 0), (6, 0, 40, 1)]
+    rows = [(1, 0, 0.2, 0), (3, 0, 0.9, 0), (2, 0, 0.8, 0), (5, 0, 0.1, 1)]  # near but unsure, far but sure
+    for order in itertools.permutations(rows):
+        scores = run(truth_of([keypoints]), [found(*order)])
+        assert scores["error_rms_px"] == pytest.approx(np.sqrt((2**2 + 3**2) / 2))
+        assert scores.overall.counts["duplicate"] == 2
+
+
 def test_a_detection_belongs_to_the_nearest_keypoint_not_the_first():
     # one detection between two keypoints, both in reach
     scores = run(truth_of([[(0, 0, 100, 0), (8, 0, 100, 1)]]), [found((5, 0, 1, 1))])
@@ -563,7 +585,9 @@ def test_many_different_scenes_are_pooled_without_changing_the_width(monkeypatch
     monkeypatch.setattr(score_module, "MOST_KINDS", 5)
     assert len(score_module._unique_rows(np.array([[0, 1], [2, 3], [0, 1]]))[0]) == 2
     monkeypatch.setattr(score_module, "MOST_KINDS", 100)
-    monkeypatch.setattr(score_module, "_unique_rows", lambda table: (table, np.ones(len(table), np.int64)))
+    monkeypatch.setattr(
+        score_module, "_unique_rows", lambda table: (table[np.lexsort(table.T)], np.ones(len(table), int))
+    )
     pooled = score(truth, detections, resamples=2000).overall.intervals
     for name in ("detection_score", "average_false_alarm", "f1"):
         a, b = exact[name], pooled[name]

@@ -94,13 +94,14 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     import json
 
     from kpbench.cli.progress import progress_bar
-    from kpbench.pipeline import degrade_files, image_files
+    from kpbench.pipeline import degrade_files
+    from kpbench.sources import open_images
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
     steps = tuple(zip(effects, levels, strict=True))
-    photos = image_files(source)
-    with progress_bar(len(photos.files), "degrade") as progress:
-        for path, applied in degrade_files(photos, out, steps, seed):
+    images = open_images(str(source))
+    with progress_bar(images.length, "degrade") as progress:
+        for path, applied in degrade_files(images, out, steps, seed):
             click.echo(f"{path} {json.dumps(applied)}")
             progress(1)

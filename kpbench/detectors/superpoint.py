@@ -8,20 +8,30 @@ it, whichever cells that lies in.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench import refine
+from kpbench.design import Patch, shipped_patches
 from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
 
-__all__ = ["Decoding", "SuperPointDetector", "decode", "open_session", "pad_to_cells"]
+__all__ = [
+    "Decoding",
+    "SmallSuperPointDetector",
+    "SuperPointDetector",
+    "decode",
+    "fit_designs",
+    "open_session",
+    "pad_to_cells",
+]
 
 CELL = 8
 SCHEMA = "kpbench.superpoint/1"
@@ -125,8 +135,45 @@ def open_session(model: bytes, threads: int = 0) -> Any:
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
-Refine = Callable[[UInt8, Detections], Detections]
-"""Moves detections in a grey image to a better place, e.g. by fitting the design."""
+LEAST_FIT = 0.8
+"""Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
+
+
+def fit_designs(grey: UInt8, found: Detections, patches: Sequence[Patch]) -> Detections:
+    """Move each detection to the centre of its design, fitted to the pixels around it.
+
+    Where the design does not fit (:data:`LEAST_FIT`), or its centre is further off than a network errs
+    (3 px, or a quarter of the patch's short semi-axis), the detection stays where it was.
+
+    Parameters
+    ----------
+    grey : ndarray of shape (H, W), uint8
+    found : Detections
+        With ``patch_id``; scores and identities are not changed.
+    patches : sequence of Patch
+    """
+    if not len(found) or found.patch_id is None or min(grey.shape) < 2 * refine.RING_PX:
+        return found
+    known = refine.bank(patches)
+    raw, smooth = refine.pyramid(grey, 0), refine.pyramid(grey)
+    octaves = min(4, len(smooth))
+    level = np.tile(np.arange(octaves), len(found))
+    poses = refine.search(smooth, np.repeat(found.xy, octaves, axis=0), level, known, margin=2.0)
+    designs = len(patches)  # a margin of 2 keeps a pose of every design at every place and octave
+    owner = np.repeat(np.arange(len(found)), octaves * designs)
+    ids = np.array([patch.patch_id for patch in patches])
+    own = ids[poses.which] == found.patch_id[owner]
+    poses, owner = poses[own], owner[own]
+    poses = refine.align(smooth, poses, known.core, 3, 0.9 * refine.RING_PX)
+    order = np.lexsort((-poses.ncc, owner))
+    owner, first = np.unique(owner[order], return_index=True)
+    whole = refine.align(smooth, refine.extend(smooth, poses[order[first]], known), known.whole, 4, 5.6)
+    fit = refine.fit(raw, whole.xy, whole.A, [patches[n] for n in whole.which])
+    moved = np.linalg.norm(fit.xy - found.xy[owner], axis=1)
+    good = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.25 * refine.short_axis(fit.A)))
+    xy = found.xy.copy()
+    xy[owner[good]] = fit.xy[good]
+    return Detections(xy, found.score, found.patch_id)
 
 
 @dataclass
@@ -135,11 +182,11 @@ class SuperPointDetector:
 
     Attributes
     ----------
-    path : Path
-        ONNX file written by ``kpbench export-model``.
+    path : Path, optional
+        ONNX file written by ``kpbench export-model``; None: the weights that ship with kpbench.
     decoding : Decoding
-    refine : callable, optional
-        Applied last, to the grey image and the detections.
+    patches : sequence of Patch, optional
+        The designs: each detection is then fitted to its design, see :func:`fit_designs`. None: it is not.
     threads : int
         Threads of ONNX Runtime; 0 leaves the choice to it.
 
@@ -149,20 +196,23 @@ class SuperPointDetector:
         If the file cannot be read or was not written by kpbench.
     """
 
-    path: Path
+    path: Path | None = None
     decoding: Decoding = field(default_factory=Decoding)
-    refine: Refine | None = None
+    patches: Sequence[Patch] | None = field(default_factory=shipped_patches)
     threads: int = 0
+    shipped: ClassVar[str] = "superpoint.onnx"
 
     def __post_init__(self) -> None:
+        self.path = Path(__file__).parent.parent / "weights" / self.shipped if self.path is None else Path(self.path)
         try:
-            self._session = open_session(Path(self.path).read_bytes(), self.threads)
+            self._session = open_session(self.path.read_bytes(), self.threads)
             content = json.loads(self._session.get_modelmeta().custom_metadata_map.get("kpbench", "{}"))
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
             raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
         if content.get("schema") != SCHEMA:
             raise DataError(f"{self.path}: not written by kpbench export-model, expected schema {SCHEMA!r} inside")
         self.content: dict[str, Any] = content
+        self.name, self.version = str(content["name"]), f"{content['designs'][:8]}-{content['samples']}"
         self._patch_ids = np.array([p["id"] for p in content["patches"]], np.int64)
 
     def __call__(self, image: UInt8) -> Detections:
@@ -175,9 +225,16 @@ class SuperPointDetector:
         inside = np.all((found.xy > -0.5) & (found.xy < (width - 0.5, height - 0.5)), axis=1)
         found = found[inside]
         found = Detections(found.xy, found.score, self._patch_ids[found.patch_id])
-        return found if self.refine is None else self.refine(grey, found)
+        return found if self.patches is None else fit_designs(grey, found, self.patches)
 
     detect = __call__
+
+
+@dataclass
+class SmallSuperPointDetector(SuperPointDetector):
+    """The same with the smaller network."""
+
+    shipped: ClassVar[str] = "superpoint-small.onnx"
 
 
 def _first_line(error: Exception) -> str:

@@ -1,0 +1,298 @@
+import hashlib
+import json
+import pickle
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kpbench import degrade, store
+from kpbench.cli import main
+from kpbench.errors import DataError
+from kpbench.pipeline import generate
+from kpbench.suite import SuiteConfig, load_suite, shipped_suites
+
+SMALL = (203, 155)
+
+
+def config(name="paper-v1", **changes):
+    return SuiteConfig(load_suite(name), **{"images": 2, "size_px": SMALL, **changes})
+
+
+def truth_digest(suite, scenes=2):
+    """SHA-256 of all that the images of a suite are a function of, at its own size, places to 1e-4 px."""
+    made = SuiteConfig(load_suite(suite), images=scenes)
+    said = hashlib.sha256()
+    for index in range(made.n):
+        shot = made.shot(index)
+        places = [np.round(shot.keypoints[name], 4).tolist() for name in ("x", "y", "radius_major", "radius_minor")]
+        look = [round(v, 6) for v in (shot.look.black, shot.look.white, shot.look.light, *shot.look.slope)]
+        row = [shot.condition, shot.rung, shot.scene, shot.keypoints["patch_id"].tolist(), places, look, shot.effects]
+        said.update(json.dumps(row).encode())
+    said.update("".join(patch.digest for patch in made.suite.patches).encode())
+    return said.hexdigest()[:16]
+
+
+@pytest.mark.parametrize(("name", "digest"), [("paper-v1", "ada17e3c064af31d"), ("extended-v1", "8044ad33e95e77b6")])
+def test_a_published_suite_never_changes(name, digest):
+    """If this fails, the change makes a new suite, such as paper-v2; a frozen one keeps its truth."""
+    assert truth_digest(name) == digest
+
+
+def test_a_published_suite_keeps_its_pixels():
+    """To a tenth of a grey level in the mean, so that another OpenCV may round differently."""
+    means = [
+        SuiteConfig(load_suite("paper-v1"), images=1, size_px=(812, 620)).make(n)[0].image.mean() for n in (0, 27, 80)
+    ]
+    assert np.allclose(means, (134.916, 151.746, 31.205), atol=0.1)
+
+
+def test_the_papers_conditions_are_the_papers():
+    conditions = {c.name: c.rungs for c in load_suite("paper-v1").conditions}
+    assert conditions == {
+        "scale": (0.5, 1, 2, 4, 8, 16, 32),
+        "pitch": (0, 10, 20, 30, 40, 50, 60),
+        "blur": (3, 7, 11, 15),
+        "dimming": (10, 20, 30, 40),
+        "noise": (15, 30, 45, 60),
+    }
+    assert SuiteConfig(load_suite("paper-v1")).n == 26 * 4 * 500
+    assert sorted(shipped_suites()) == ["extended-v1", "paper-v1"]
+
+
+def test_one_scene_is_the_same_under_every_rung_and_patch():
+    made = config()
+    blurred = [n for n in range(made.n) if made.shot(n).condition == "blur"]
+    pitch0 = next(n for n in range(made.n) if made.shot(n).condition == "pitch")
+    for step, patch in [(0, 0), (3, 2)]:
+        worn, _ = made.make(blurred[0] + (step * 4 + patch) * 2 + 1)
+        clean, _ = made.make(pitch0 + patch * 2 + 1)
+        assert worn.scene_id == clean.scene_id == 1
+        assert (degrade.blur(clean.image, (3, 7, 11, 15)[step]) == worn.image).all()
+        for name in ("x", "y", "patch_id", "H_patch2image", "visible"):
+            assert (worn.keypoints[name] == clean.keypoints[name]).all()
+        assert (worn.keypoints["contrast"] < clean.keypoints["contrast"]).all()
+
+
+def test_noise_of_one_scene_is_one_field_scaled():
+    made = config(only=("noise",), images=1)
+    base = config(only=("pitch",), images=1).make(0)[0].image.astype(int)
+    weak, strong = (made.make(n)[0].image.astype(int) - base for n in (0, 4))
+    middle = (base > 100) & (base < 150)
+    assert abs(2 * weak - strong)[middle].max() <= 2  # rounding
+
+
+def test_the_order_of_the_images():
+    made = config(only=("scale", "noise"))
+    seen = [(s.condition, s.rung, int(s.keypoints["patch_id"][0]), s.scene) for s in map(made.shot, range(made.n))]
+    rungs = [("scale", r) for r in (0.5, 1, 2, 4, 8, 16, 32)] + [("noise", r) for r in (15, 30, 45, 60)]
+    assert seen == [(c, r, patch, scene) for c, r in rungs for patch in range(4) for scene in range(2)]
+
+
+def test_fewer_images_and_fewer_conditions_are_a_part_of_more():
+    many, few = config(images=3), config(images=2, only=("dimming",))
+    shot = few.shot(7)
+    assert (shot.condition, shot.rung, shot.scene) == ("dimming", 10, 1)
+    same = [n for n in range(many.n) if many.shot(n).condition == "dimming"][3 * 3 + 1]
+    assert (few.make(7)[0].image == many.make(same)[0].image).all()
+
+
+def test_a_smaller_camera_sees_the_same():
+    large, small = config(size_px=(1624, 1240)), config(size_px=(812, 620))
+    for n in (0, 50, 100):
+        a, b = large.shot(n).keypoints, small.shot(n).keypoints
+        assert np.allclose((a["x"] + 0.5) / 2 - 0.5, b["x"])
+        assert np.allclose((a["y"] + 0.5) / 2 - 0.5, b["y"])
+        assert np.allclose(a["radius_major"] / 2, b["radius_major"])
+    assert np.isclose(small.camera.focal_px / 812, 4 / 0.0045 / 1624)
+
+
+def test_a_lens_bends_the_board():
+    straight, bent = config(only=("scale",)), config(only=("scale",), distortion=(-0.3,))
+    a, b = (c.shot(40).keypoints for c in (straight, bent))
+    assert abs(a["x"] - b["x"]).max() > 0.3
+    assert bent.to_dict()["distortion"] == [-0.3, 0, 0, 0, 0]
+
+
+def test_occluded_patches_are_visible_as_far_as_they_are():
+    made = config("extended-v1", only=("occlusion",), size_px=(812, 620), images=1)
+    for n, level in ((0, 10), (12, 40)):
+        visible = made.make(n)[0].keypoints["visible"]
+        assert np.allclose(visible, 1 - level / 100, atol=0.01)
+
+
+def test_every_extended_condition_changes_the_image():
+    made = config("extended-v1", images=1)
+    base = config(only=("pitch",), images=1).make(0)[0].image
+    firsts = {}
+    for n in range(0, made.n, 4):
+        firsts.setdefault(made.shot(n).condition, n)
+    for n in firsts.values():
+        sample, _ = made.make(n)
+        assert (sample.image != base).any()
+        assert sample.image.shape == base.shape
+
+
+def digests(folder):
+    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir())}
+
+
+def test_interrupted_and_resumed_is_the_same(tmp_path):
+    made = config(only=("blur",), shard_size=10)
+    generate(made, tmp_path / "one", workers=1)
+
+    class Stop(Exception):
+        pass
+
+    done = 0
+
+    def interrupt(images):
+        nonlocal done
+        done += images
+        if done > 15:
+            raise Stop
+
+    with pytest.raises(Stop):
+        generate(made, tmp_path / "two", workers=1, progress=interrupt)
+    run = generate(pickle.loads(pickle.dumps(made)), tmp_path / "two", workers=1, resume=True)
+    assert run.kept == 10
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    truth = run.dataset.truth
+    assert set(truth.condition) == {"blur"}
+    assert np.unique(truth.rung).tolist() == [3, 7, 11, 15]
+    assert np.bincount(truth.scene_id).tolist() == [16, 16]
+    assert run.dataset.effects(0) == [{"effect": "blur", "kernel_px": 3}]
+
+
+def test_photographs_are_shared_by_a_scenes_images_too(tmp_path):
+    for n in range(3):
+        cv2.imwrite(str(tmp_path / f"{n}.png"), np.full((90, 120), 40 + 60 * n, np.uint8))
+    made = config(backgrounds=tmp_path)
+    assert made.make(0)[0].background == made.make(2)[0].background == made.make(200)[0].background
+    assert made.to_dict()["backgrounds"]["files"] == 3
+
+
+TEXT = shipped_suites()["paper-v1"].read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('schema = "kpbench.suite/1"', 'schema = "kpbench.suite/2"', "schema is 'kpbench.suite/2', expected"),
+        ("lens_mm = 4.0", "lens_mm = -4", "camera.lens_mm is -4, expected a number from 0.01"),
+        ("size_px = [1624, 1240]", "size_px = [1624]", r"camera.size_px is \[1624\], expected a list of 2 numbers"),
+        ("pitch_deg = 0\n", "pitch = 0\n", "unknown key 'pitch' in scene"),
+        ("yaw_deg = 0\n", "", r"scene.yaw_deg is None, expected a number"),
+        ("white = [190, 245]", "white = [245, 190]", r"scene.white is \[245, 190\], expected \[least, most\]"),
+        (
+            "{ blur = [3, 7, 11, 15] }",
+            "{ blur = [3, 7, 11] }",
+            r"condition\[2\].effects.blur is \[3, 7, 11\], expected a",
+        ),
+        ("{ blur = [3, 7, 11, 15] }", "{ fog = [3, 7, 11, 15] }", r"unknown key 'fog' in condition\[2\].effects"),
+        (
+            "{ blur = [3, 7, 11, 15] }",
+            "{ blur = [0, 7, 11, 15] }",
+            r"condition\[2\].effects.blur is 0, expected a number",
+        ),
+        ('name = "pitch"', 'name = "scale"', "two conditions share a name"),
+        ('"checker"', '"square"', "patch 'square' is not known"),
+        ("images = 500", "images = true", "images is True, expected a number"),
+        ("[camera]", "[camera", "not valid TOML"),
+    ],
+)
+def test_a_wrong_suite_is_one_line(tmp_path, old, new, says):
+    assert old in TEXT
+    path = tmp_path / "mine.toml"
+    path.write_text(TEXT.replace(old, new, 1))
+    with pytest.raises(DataError, match=rf"mine\.toml: .*{says}"):
+        load_suite(str(path))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"images": 0}, "--images is 0"),
+        ({"seed": -1}, "--seed is -1"),
+        ({"size_px": (30, 30)}, "--size is 30x30"),
+        ({"only": ("scale", "fog")}, "paper-v1 has no condition 'fog', only: scale, pitch, blur, dimming, noise"),
+    ],
+)
+def test_a_value_out_of_range_is_one_line(changes, says):
+    with pytest.raises(DataError, match=says):
+        config(**changes)
+
+
+def run(*arguments):
+    return CliRunner().invoke(main, [str(a) for a in arguments])
+
+
+def test_the_suite_command(tmp_path):
+    made = ("suite", "paper-v1", "--images", 1, "--size", "203x155", "--workers", 1, "--only", "scale,blur")
+    first = run(*made, "--out", tmp_path / "a")
+    assert first.exit_code == 0, first.output
+    assert "44 images, 1 shards, fingerprint" in first.stdout
+    assert run(*made, "--out", tmp_path / "b", "--distortion", "0,0").exit_code == 0
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+    again = run(*made, "--out", tmp_path / "a", "--seed", 1)
+    assert again.exit_code == 1
+    assert "already holds a dataset" in again.stderr
+    unknown = run("suite", "paper-v9")
+    assert unknown.exit_code == 1
+    assert unknown.stderr == (
+        "kpbench: there is no suite 'paper-v9', only: extended-v1, paper-v1, or a .toml file of your own\n"
+    )
+    assert run("suite", "paper-v1", "--distortion", "much").exit_code == 2
+
+
+def test_the_degrade_command(tmp_path):
+    source = tmp_path / "in"
+    (source / "deep").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    grey = rng.integers(0, 255, (40, 50), dtype=np.uint8)
+    colour = rng.integers(0, 255, (40, 50, 3), dtype=np.uint8)
+    cv2.imwrite(str(source / "grey.png"), grey)
+    cv2.imwrite(str(source / "deep" / "colour.png"), colour)
+    (source / "broken.jpg").write_bytes(b"no image")
+    done = run("degrade", source, "--effect", "blur", "--level", 7, "--out", tmp_path / "out")
+    assert done.exit_code == 0, done.output
+    assert len(done.stdout.splitlines()) == 2
+    got = cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED)
+    assert (got == degrade.blur(grey, 7)).all()
+    got = cv2.imread(str(tmp_path / "out" / "deep" / "colour.png"), cv2.IMREAD_UNCHANGED)
+    assert (got == degrade.blur(colour, 7)).all()
+    stack = ("--effect", "noise", "--level", 20, "--effect", "jpeg", "--level", 40)
+    one = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "one")
+    two = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "two")
+    assert '[{"effect": "noise", "sigma": 20.0}, {"effect": "jpeg", "quality": 40.0}]' in one.stdout
+    assert two.exit_code == 0
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere.png", "--effect", "blur", "--level", "7"], "nowhere.png: no such dataset, image, folder or video"),
+        ([__file__, "--effect", "blur", "--level", "7"], "cannot be decoded as an image"),
+        ([Path(__file__).parent, "--effect", "blur", "--level", "7"], "neither a dataset nor a folder with images"),
+    ],
+)
+def test_what_cannot_be_degraded_is_one_line(arguments, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = run("degrade", *arguments)
+    assert told.exit_code == 1
+    assert says in told.stderr
+    assert told.stderr.count("\n") == 1
+
+
+def test_every_effect_needs_its_level():
+    assert run("degrade", "a.png", "--effect", "blur").exit_code == 2
+    assert run("degrade", "a.png", "--effect", "blur", "--level", 3, "--level", 5).exit_code == 2
+
+
+def test_the_help_names_every_effect():
+    told = " ".join(run("degrade", "--help").stdout.split())
+    for effect in set(degrade.LADDER) - {"dimming-literal"}:
+        assert effect in told
