@@ -238,7 +238,7 @@ def _parse(data: bytes, place: str) -> Any:
 
 
 def _header(content: Any) -> dict[str, Any]:
-    """Check the part that all formats share; gives the keyword arguments ``detector``, ``dataset`` and ``fingerprint``."""
+    """Check what all formats share; gives the keyword arguments ``detector``, ``dataset``, ``fingerprint``."""
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         found = repr(content["schema"]) if isinstance(content, dict) and "schema" in content else "missing"
         raise PredictionsError(f"schema is {found}, expected {SCHEMA!r}")

@@ -296,13 +296,13 @@ def train(
     if threads:
         torch.set_num_threads(threads)
     designs = tuple(patches or shipped_patches())
-    if len(designs) != recipe.network.ids:
-        raise DataError(f"the network tells {recipe.network.ids} patches apart, but there are {len(designs)} designs")
-    if recipe.batch % world or recipe.batch < world:
-        raise DataError(f"batch is {recipe.batch}, expected a multiple of the {world} processes")
     folder = Path(out)
     checkpoint = folder / "checkpoint.safetensors"
-    if not resume_run and checkpoint.exists():
+    if len(designs) != recipe.network.ids:
+        raise DataError(f"the network tells {recipe.network.ids} patches apart, but there are {len(designs)} designs")
+    if recipe.batch % world:
+        raise DataError(f"batch is {recipe.batch}, expected a multiple of the {world} processes")
+    if checkpoint.exists() and not resume_run:
         raise DataError(f"{checkpoint}: there is a training in this folder; use --resume, or another folder")
     folder.mkdir(parents=True, exist_ok=True)
     state = start(recipe, device)
@@ -344,12 +344,12 @@ def train(
                 sums.zero_()
                 noted, since = now, state.step
             last = stop or state.step == recipe.steps
+            if rank == 0 and (last or now - saved > 60 * save_every):
+                save_checkpoint(state, checkpoint, designs)
+                saved = now
             if validation and (last or now - validated > 60 * validate_every):
                 record(state, evaluate(state.mean, validation))
                 validated = time.monotonic()
-            if rank == 0 and (last or now - saved > 60 * save_every):
-                save_checkpoint(state, checkpoint, designs)
-                saved = time.monotonic()
             if stop:
                 break
         interrupted = signalled()

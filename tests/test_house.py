@@ -22,6 +22,7 @@ LAYERS = [
     {"camera"},
     {"store", "predictions", "sources"},
     {"synth", "suite", "samples", "recipe"},
+    {"match"},
     {"refine"},
     {"detect"},
     {"score"},

@@ -1,3 +1,4 @@
+import gc
 import json
 import sys
 
@@ -27,6 +28,7 @@ def some(n=5, ids=True, seed=0):
         patch_id=rng.integers(0, 4, k) if ids else None,
         detector={"name": "ünï", "version": "1"},
         dataset="some/where",
+        fingerprint="a" * 64,
     )
 
 
@@ -48,7 +50,7 @@ def test_every_format_gives_back_every_bit(tmp_path, suffix, ids):
     write_predictions(path, p)
     q = read_predictions(str(path))
     assert as_dict(q) == as_dict(p)
-    assert (q.detector, q.dataset) == (p.detector, p.dataset)
+    assert (q.detector, q.dataset, q.fingerprint) == (p.detector, p.dataset, p.fingerprint)
     first = path.read_bytes()
     write_predictions(path, p)
     assert path.read_bytes() == first
@@ -239,6 +241,7 @@ def test_a_bad_file_is_one_line(tmp_path, name, content, problem):
         read_predictions(path)
     assert str(error.value).startswith(f"{path}: {problem}")
     assert "\n" not in str(error.value)
+    assert gc.isenabled()  # paused while reading
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -392,7 +395,7 @@ def test_the_json_is_what_the_schema_says(tmp_path):
     p = some(4)
     write_predictions(path, p)
     content = json.loads(path.read_text())
-    assert list(content) == ["schema", "dataset", "detector", "predictions"]
+    assert list(content) == ["schema", "dataset", "fingerprint", "detector", "predictions"]
     assert content["schema"] == "kpbench.predictions/1"
     for n, (entry, d) in enumerate(zip(content["predictions"], p.detections(), strict=True)):
         assert entry == {

@@ -217,6 +217,13 @@ def test_no_order_changes_anything(images, eps, random):
     assert score(truth, c, eps=eps, resamples=20).to_dict() == a
 
 
+def test_the_order_of_many_images_changes_no_digit():
+    rng = np.random.default_rng(5)
+    images = [([(10, 10, rng.uniform(5, 50), 0)], [(10 + rng.normal(), 10, rng.random(), 0)]) for _ in range(500)]
+    a, b = (run(*tables(order), eps=1) for order in (images, images[::-1]))
+    assert [a[name] for name in METRICS] == [b[name] for name in METRICS]
+
+
 @given(IMAGES, EPS, st.sampled_from([(64.0, 1.0), (-512.0, 1.0), (0.0, 4.0), (16.0, 0.5)]))
 @settings(max_examples=60, deadline=None)
 def test_translation_and_scale_change_nothing_but_pixels(images, eps, change):
@@ -346,6 +353,8 @@ def test_equal_scores_and_distances_are_decided_by_place():
     rows = [(11, 10, 0.5, 1), (10, 11, 0.5, 0), (9, 10, 0.5, 2), (10, 9, 0.5, 3)]
     for order in itertools.permutations(rows):
         assert run(truth_of([[(10, 10, 50, 2)]]), [found(*order)])["id_matching_score"] == 1  # lowest x
+    for order in itertools.permutations([(10, 11, 0.5, 1), (10, 9, 0.5, 2)]):
+        assert run(truth_of([[(10, 10, 50, 2)]]), [found(*order)])["id_matching_score"] == 1  # lowest y
     # two keypoints, two detections, both assignments worth the same
     keypoints, pair = [(0, 0, 50, 0), (4, 0, 50, 1)], [(2, 1, 0.5, 0), (2, -1, 0.5, 1)]
     results = {
@@ -628,8 +637,9 @@ def test_predictions_must_be_for_the_images():
 def test_another_datasets_fingerprint_is_refused():
     truth = Truth(**{**vars(truth_of([[]])), "fingerprint": "a" * 64})
     assert score(truth, Predictions.from_detections([found()], dataset="a" * 64)).fingerprint == "a" * 64
-    with pytest.raises(PredictionsError, match="fingerprint bbbbbbbbbbbb…, but this dataset's is aaaaaaaaaaaa…"):
-        score(truth, Predictions.from_detections([found()], dataset="b" * 64))
+    for about in ({"dataset": "b" * 64}, {"dataset": "folder", "fingerprint": "b" * 64}):
+        with pytest.raises(PredictionsError, match="fingerprint bbbbbbbbbbbb…, but this dataset's is aaaaaaaaaaaa…"):
+            score(truth, Predictions.from_detections([found()], **about))
 
 
 def test_truth_that_cannot_be_scored():

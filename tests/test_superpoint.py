@@ -7,8 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells
+from kpbench.design import shipped_patches
+from kpbench.detectors import superpoint
+from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, fit_designs, pad_to_cells
 from kpbench.errors import DataError
+from kpbench.keypoints import Detections
+from kpbench.scene import Placement, render_scene
+
+PATCHES = shipped_patches()
 
 
 def heads(points, h, w, ids=None, spread=0.0):
@@ -32,10 +38,10 @@ def heads(points, h, w, ids=None, spread=0.0):
 
 @given(st.floats(4, 59), st.floats(4, 43), st.floats(0, 1.2))
 def test_the_position_is_the_mean_of_the_distribution_across_cell_borders(x, y, spread):
-    found = decode(*heads([(x, y)], 6, 8, spread=spread if spread > 0.4 else 0.0))
+    found = decode(*heads([(x, y)], 6, 8, spread=spread if spread > 0.6 else 0.0))
     assert len(found) == 1
     # the window cuts the tails of a wide blob unevenly about a keypoint between two pixels
-    np.testing.assert_allclose(found.xy[0], (x, y), atol=1e-3 if spread <= 0.4 else 0.05)
+    np.testing.assert_allclose(found.xy[0], (x, y), atol=1e-3 if spread <= 0.6 else 0.05)
     assert found.score[0] > 0.9
 
 
@@ -108,7 +114,13 @@ def brightest_pixel_model(schema="kpbench.superpoint/1"):
         constants,
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    content = {"schema": schema, "name": "brightest", "patches": [{"id": 5}, {"id": 7}]}
+    content = {
+        "schema": schema,
+        "name": "brightest",
+        "designs": "0" * 64,
+        "samples": 0,
+        "patches": [{"id": 5}, {"id": 7}],
+    }
     helper.set_model_props(model, {"kpbench": json.dumps(content)})
     onnx.checker.check_model(model)
     return model.SerializeToString()
@@ -118,7 +130,7 @@ def brightest_pixel_model(schema="kpbench.superpoint/1"):
 def detector(tmp_path):
     path = tmp_path / "brightest.onnx"
     path.write_bytes(brightest_pixel_model())
-    return SuperPointDetector(path, threads=1)
+    return SuperPointDetector(path, patches=None, threads=1)
 
 
 @pytest.mark.parametrize("shape", [(40, 48), (41, 51), (9, 17), (40, 48, 3)])
@@ -137,9 +149,41 @@ def test_what_lies_in_the_padding_is_no_detection(detector):
     assert np.all(found.xy < (16.5, 8.5))
 
 
-def test_refinement_gets_the_grey_image_and_has_the_last_word(detector):
-    detector.refine = lambda grey, found: (grey.shape, len(found))
-    assert detector(np.zeros((16, 24, 3), np.uint8)) == ((16, 24), 0)
+def scene():
+    """Two patches on an even ground, and what a network that errs by a pixel would say of them."""
+    placements = [
+        Placement(PATCHES[1], np.array([[12.0, 2.0, 40.3], [-1.0, 9.0, 30.8], [0.0, 0.001, 1.0]]), 20.0, 230.0),
+        Placement(PATCHES[3], np.array([[0.0, -30.0, 110.6], [30.0, 0.0, 70.1], [0.0005, 0.0, 1.0]]), 40.0, 200.0),
+    ]
+    rendered = render_scene(np.full((128, 160), 120, np.uint8), placements)
+    xy = np.column_stack([rendered.keypoints["x"], rendered.keypoints["y"]])
+    return rendered.image, xy, rendered.keypoints["patch_id"]
+
+
+def test_fitting_the_design_finds_the_centre_to_a_hundredth_of_a_pixel():
+    image, xy, ids = scene()
+    rough = Detections(np.add(xy, [[0.9, -0.8], [-1.0, 1.2]]), [0.9, 0.8], ids)
+    fitted = fit_designs(image, rough, PATCHES)
+    np.testing.assert_allclose(fitted.xy, xy, atol=0.02)
+    assert fitted.score.tolist() == [0.9, 0.8]
+    assert np.array_equal(fitted.patch_id, ids)
+
+
+def test_what_fits_no_design_stays_where_it_was():
+    image, xy, ids = scene()
+    places = np.array([[20.0, 100.0], [xy[0, 0] + 8, xy[0, 1]]])  # bare ground; 8 px beside a centre
+    fitted = fit_designs(image, Detections(places, [0.9, 0.8], [0, ids[0]]), PATCHES)
+    np.testing.assert_array_equal(fitted.xy, places)
+
+
+def test_nothing_to_fit_is_nothing():
+    assert len(fit_designs(np.zeros((40, 40), np.uint8), Detections.none(), PATCHES)) == 0
+
+
+def test_the_detector_fits_the_designs_that_it_is_given(detector, monkeypatch):
+    detector.patches = PATCHES
+    monkeypatch.setattr(superpoint, "fit_designs", lambda grey, found, patches: (grey.shape, len(found), patches))
+    assert detector(np.zeros((16, 24, 3), np.uint8)) == ((16, 24), 0, PATCHES)
 
 
 @pytest.mark.parametrize(

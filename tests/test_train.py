@@ -1,5 +1,6 @@
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import asdict, replace
@@ -248,3 +249,21 @@ def test_two_processes_train_one_network(tmp_path, photos):
     assert digests[0][0] == digests[0][1]
     assert digests[1][0] == digests[1][1]
     assert digests[0] != digests[1]
+
+
+def test_an_interrupt_ends_after_the_step_with_a_checkpoint_that_resumes(tmp_path, run, monkeypatch):
+    step = training.step_once
+
+    def interrupted(state, *rest):
+        if state.step == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return step(state, *rest)
+
+    run(RECIPE, tmp_path / "whole")
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "step_once", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="is at step 3; the same command with --resume goes on"):
+            run(RECIPE, tmp_path / "parts")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert run(RECIPE, tmp_path / "parts", resume_run=True)
+    assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import refine
+from kpbench import match, refine
 from kpbench.design import Patch, shipped_patches
 from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
@@ -152,25 +152,25 @@ def fit_designs(grey: UInt8, found: Detections, patches: Sequence[Patch]) -> Det
         With ``patch_id``; scores and identities are not changed.
     patches : sequence of Patch
     """
-    if not len(found) or found.patch_id is None or min(grey.shape) < 2 * refine.RING_PX:
+    if not len(found) or found.patch_id is None or min(grey.shape) < 2 * match.RING_PX:
         return found
-    known = refine.bank(patches)
-    raw, smooth = refine.pyramid(grey, 0), refine.pyramid(grey)
+    known = match.bank(patches)
+    raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
     octaves = min(4, len(smooth))
     level = np.tile(np.arange(octaves), len(found))
-    poses = refine.search(smooth, np.repeat(found.xy, octaves, axis=0), level, known, margin=2.0)
+    poses = match.search(smooth, np.repeat(found.xy, octaves, axis=0), level, known, margin=2.0)
     designs = len(patches)  # a margin of 2 keeps a pose of every design at every place and octave
     owner = np.repeat(np.arange(len(found)), octaves * designs)
     ids = np.array([patch.patch_id for patch in patches])
     own = ids[poses.which] == found.patch_id[owner]
     poses, owner = poses[own], owner[own]
-    poses = refine.align(smooth, poses, known.core, 3, 0.9 * refine.RING_PX)
+    poses = match.align(smooth, poses, known.core, 3, 0.9 * match.RING_PX)
     order = np.lexsort((-poses.ncc, owner))
     owner, first = np.unique(owner[order], return_index=True)
-    whole = refine.align(smooth, refine.extend(smooth, poses[order[first]], known), known.whole, 4, 5.6)
+    whole = match.align(smooth, match.extend(smooth, poses[order[first]], known), known.whole, 4, 5.6)
     fit = refine.fit(raw, whole.xy, whole.A, [patches[n] for n in whole.which])
     moved = np.linalg.norm(fit.xy - found.xy[owner], axis=1)
-    good = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.25 * refine.short_axis(fit.A)))
+    good = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.25 * match.short_axis(fit.A)))
     xy = found.xy.copy()
     xy[owner[good]] = fit.xy[good]
     return Detections(xy, found.score, found.patch_id)

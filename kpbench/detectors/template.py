@@ -4,7 +4,8 @@ Edges that meet at a point point at it, under any perspective. So the first stag
 asks of every pixel whether the gradients around it are square to the direction to it, and are of more than
 one direction (a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
 location of distinct points*, 1987). That needs no templates. The few hundred places that remain are
-compared with the designs by :mod:`kpbench.refine`, coarse to fine, each stage on what the one before kept.
+compared with the designs (:mod:`kpbench.match`), coarse to fine, each stage on what the one before kept, and
+what is left is fitted (:mod:`kpbench.refine`).
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import __version__, refine
+from kpbench import __version__, match, refine
 from kpbench.design import Patch, shipped_patches
-from kpbench.detect import suppress, to_grey
+from kpbench.detect import to_grey
 from kpbench.keypoints import Detections, Float, UInt8
 
 __all__ = ["TemplateDetector", "crossings"]
@@ -72,8 +73,8 @@ def crossings(level: Float32) -> tuple[Float, Float]:
     return np.column_stack([columns, rows])[best].astype(np.float64), found[best].astype(np.float64)
 
 
-CORE, WHOLE, MOST = 0.87, 0.7, 80
-"""Least correlations of a candidate near its centre and as a whole; most candidates that are fitted."""
+CORE, LIKENESS, MOST = 0.89, 11.5, 80
+"""Least correlation of a candidate near its centre, least :func:`_likeness`, most candidates of one image."""
 
 
 @dataclass(frozen=True)
@@ -105,17 +106,21 @@ class Candidates:
         """
         contrast = np.maximum(self.fit.white - self.fit.black, 1.0)
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
-        relative_blur = np.minimum(self.fit.blur_px / np.maximum(refine.short_axis(self.fit.A), 0.5), 1)
+        relative_blur = np.minimum(self.fit.blur_px / np.maximum(match.short_axis(self.fit.A), 0.5), 1)
         evidence = (
             -12.26
-            - 2.28 * np.log(1.01 - self.core)
-            - 2.44 * np.log(1.01 - self.whole)
+            + _likeness(self.core, self.whole)
             - 0.63 * np.log(np.minimum(unexplained, 3) + 0.02)
             - 14.16 * relative_blur
             + 2.81 * np.log(contrast / (self.range + 5))
         )
         sane = (self.fit.white > self.fit.black) & np.isfinite(evidence)
         return np.where(sane, 1 / (1 + np.exp(-np.clip(evidence, -30, 30))), 0.0)
+
+
+def _likeness(core: Float, whole: Float) -> Float:
+    """What the two correlations are worth, in units of log odds."""
+    return np.asarray(-2.28 * np.log(1.01 - core) - 2.44 * np.log(1.01 - whole))
 
 
 @dataclass(frozen=True)
@@ -147,17 +152,17 @@ class TemplateDetector:
 
     def candidates(self, grey: UInt8) -> Candidates:
         """Everything in a grey image that is enough like a design to be fitted."""
-        known = refine.bank(self.patches)
-        raw, smooth = refine.pyramid(grey, 0), refine.pyramid(grey)
-        poses = refine.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
+        known = match.bank(self.patches)
+        raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
+        poses = match.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
         poses = poses[poses.ncc > 0.62]
         for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
-            poses = refine.align(smooth, poses, known.core, steps, 0.9 * refine.RING_PX)
+            poses = match.align(smooth, poses, known.core, steps, 0.9 * match.RING_PX)
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[:MOST]]
-        whole = refine.align(smooth, refine.extend(smooth, core, known), known.whole, 4, 5.6)
-        sure = whole.ncc > WHOLE
+        whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
+        sure = _likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
         dark, bright = np.percentile(grey[::4, ::4], (2, 98))
@@ -166,9 +171,11 @@ class TemplateDetector:
 
 def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
     """Crossings of four octaves: (n, 2) px of the image, and the octave of each."""
-    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5)), *smooth[1:4]]
+    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1:4]]
     xy = [crossings(level)[0] for level in levels]
-    return np.concatenate([points * 2**n for n, points in enumerate(xy)]), np.repeat(np.arange(len(xy)), [len(points) for points in xy])
+    return np.concatenate([points * 2**n for n, points in enumerate(xy)]), np.repeat(
+        np.arange(len(xy)), [len(points) for points in xy]
+    )
 
 
 def _noise(image: Float32) -> float:
@@ -177,7 +184,7 @@ def _noise(image: Float32) -> float:
     return 1.4826 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
 
 
-def _distinct(poses: refine.Poses) -> Ints:
+def _distinct(poses: match.Poses) -> Ints:
     """Indices of poses, best first, without those that repeat a better one of the same or of a much better design."""
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
