@@ -51,7 +51,7 @@ def smooth(image: Float, sigma: float) -> Float:
 def shift(effect: str, level: float, seed: int) -> Float:
     """Measured shift of one render, (dx, dy) in px."""
     rng = np.random.default_rng(seed)
-    x, y = SIDE / 2 + rng.uniform(-0.5, 0.5, 2)
+    x, y = SIDE / 2 + rng.uniform(-4, 4, 2)  # any place on the grid of 8 x 8 blocks that JPEG uses
     turn = rng.uniform(0, 360)
     recorded = [climb(rng, effect, level, (SIDE, SIDE), np.array([[x, y, RADIUS]]))]
 
@@ -70,6 +70,8 @@ def shift(effect: str, level: float, seed: int) -> Float:
     seen = (np.hypot(column - x, row - y) < 1.6 * RADIUS) & (light - dark > 2)
     if effect not in RANDOM_FIELD:
         seen &= light < 255  # saturated: no ink to be seen
+    if not seen.any():
+        return np.full(2, np.nan)
     best, answer = np.inf, np.zeros(2)
     for sigma in (0, 0.5, 1, 1.5, 2, 3, 4, 5, 6, 8, 10):
         share = (smooth(clean, sigma) - BLACK) / (WHITE - BLACK)
@@ -120,7 +122,8 @@ def main() -> None:
             sigma = apply(flat, rng, [climb(rng, effect, level, (640, 480))]).std() if effect in RANDOM_FIELD else None
             width = edge_width(effect, level) if effect in WIDTHS else None
             ends = [f"{v:.2f}" if v is not None else "" for v in (sigma, width)]
-            numbers = [f"{bias:.4f}", f"{rms:.4f}", f"{worn.mean():.1f}", f"{10 * np.log10(255**2 / mse):.1f}", *ends]
+            moved = [f"{v:.4f}" if np.isfinite(v) else "n/a" for v in (bias, rms)]
+            numbers = [*moved, f"{worn.mean():.1f}", f"{10 * np.log10(255**2 / mse):.1f}", *ends]
             print("| " + " | ".join([effect, f"{level:g}", rungs.unit, *numbers]) + " |")
 
 

@@ -16,6 +16,7 @@ _HOMES = {
     "KEYPOINT_DTYPE": "keypoints",
     "KpbenchError": "errors",
     "Patch": "design",
+    "Predictions": "predictions",
     "Truth": "keypoints",
     "generate": "pipeline",
     "load_detector": "detect",
@@ -24,7 +25,7 @@ _HOMES = {
     "predict": "pipeline",
     "read_predictions": "predictions",
     "render_scene": "scene",
-    "score": "score",
+    "score": "scoring",
     "shipped_patches": "design",
     "write_predictions": "predictions",
 }

@@ -49,31 +49,33 @@ class Fit:
     noise: Float
 
 
-def fit(
-    levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch], steps: int = 4, largest_px: float = 40.0
-) -> Fit:
+def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]) -> Fit:
     """Fit designs to pixels.
 
     Parameters
     ----------
-    levels : from ``pyramid(image, 0)``; a patch is fitted in the finest level in which its long
-        semi-axis is at most ``largest_px``.
+    levels : from ``pyramid(image, 0)``. The first steps are taken where the patch's long semi-axis is 15 to
+        30 px, the last ones where it is at most 100 px, in the image itself if it is no larger there.
     xy, A : (N, 2), (N, 2, 2) px, where to start: right to about a tenth of the radius.
     patches : N designs.
-    steps : Gauss-Newton steps.
     """
     size = np.linalg.norm(A, 2, axis=(1, 2)) * [p.extent for p in patches] if len(patches) else np.zeros(0)
-    level = np.clip(np.ceil(np.log2(np.maximum(size, 1e-6) / largest_px)), 0, len(levels) - 1).astype(int)
-    scale = 2.0**level
-    states = [_State(xy[n] / s, A[n] / s, A[n] / s, np.zeros(2), 0.7) for n, s in enumerate(scale)]
-    for step in range(steps + 1):
-        boxes = [_box(state, patch.extent) for state, patch in zip(states, patches, strict=True)]
-        covers = coverage([_outline(s, p) for s, p in zip(states, patches, strict=True)], boxes)
-        for n, (box, cover, patch) in enumerate(zip(boxes, covers, patches, strict=True)):
-            states[n] = _step(states[n], levels[level[n]], box, cover, patch.extent, step == steps)
-    rows = np.array([[*s.xy, *s.A.ravel(), s.black, s.white, s.blur, s.ncc, s.noise] for s in states]).reshape(-1, 11)
-    xy, A = rows[:, :2] * scale[:, None], rows[:, 2:6].reshape(-1, 2, 2) * scale[:, None, None]
-    return Fit(xy, A, rows[:, 6], rows[:, 7], rows[:, 8] * scale, rows[:, 9], rows[:, 10])
+    states = [_State(xy[n], A[n], A[n], np.zeros(2), 0.5) for n in range(len(patches))]
+    for largest_px, steps in ((30.0, 2), (100.0, 3)):
+        octave = np.ceil(np.log2(np.maximum(size, 1e-6) / largest_px))
+        level = np.clip(octave, 0, len(levels) - 1).astype(np.int64).tolist()
+        states = [_scaled(state, -n) for state, n in zip(states, level, strict=True)]
+        for step in range(steps):
+            boxes = [_box(state, patch.extent) for state, patch in zip(states, patches, strict=True)]
+            covers = coverage([_outline(*pair) for pair in zip(states, patches, strict=True)], boxes)
+            states = [
+                _step(state, levels[n], box, cover, patch.extent, last=largest_px > 30 and step == steps - 1)
+                for state, n, box, cover, patch in zip(states, level, boxes, covers, patches, strict=True)
+            ]
+        states = [_scaled(state, n) for state, n in zip(states, level, strict=True)]
+    columns = [np.array([getattr(s, name) for s in states]) for name in ("black", "white", "blur", "ncc", "noise")]
+    xy, A = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A"))
+    return Fit(xy.reshape(-1, 2), A.reshape(-1, 2, 2), *columns)
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,14 @@ class _State:
     white: float = 0.0
     ncc: float = 0.0
     noise: float = np.inf
+
+
+def _scaled(state: _State, octaves: int) -> _State:
+    """From px of the image to px of a level (``octaves`` < 0), or back; a level adds 0.6 of its px of blur."""
+    factor, added = 2.0**octaves, 0.6 if octaves else 0.0
+    blur = state.blur * factor
+    blur = np.hypot(blur, added) if octaves < 0 else np.sqrt(max(blur**2 - (added * factor) ** 2, 0.04))
+    return replace(state, xy=state.xy * factor, A=state.A * factor, window=state.window * factor, blur=float(blur))
 
 
 BEYOND = 1.3
@@ -134,43 +144,50 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     ink = ink[y0 - y : y1 - y, x0 - x : x1 - x]
     dx, dy = np.arange(x0, x1) - state.xy[0], np.arange(y0, y1)[:, None] - state.xy[1]
     minor = float(short_axis(state.window[None])[0])
-    limit = max(extent - (0.35 + 0.8 * state.blur) / minor, 0.5)
-    (a, b), (c, d) = np.linalg.inv(state.window) / limit
+    (a, b), (c, d) = np.linalg.inv(state.window) / max(extent - (0.35 + 0.8 * state.blur) / minor, 0.5)
     inside = (a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < 1
-    grey, m = image[y0:y1, x0:x1][inside].astype(np.float64), ink[inside].astype(np.float64)
+    grey, m = image[y0:y1, x0:x1][inside], ink[inside]
     if len(m) < 12:
         return state
-    centred = m - m.mean()
-    slope = float(centred @ grey / max(centred @ centred, 1e-9))
-    residual = (grey - grey.mean()) - slope * centred
-    spread = float(np.var(grey))
-    ncc = np.sqrt(max(0.0, 1 - float(np.var(residual)) / max(spread, 1e-9))) * (1 if slope < 0 else -1)
-    white = float(grey.mean() - slope * m.mean())
-    noise = float(np.sqrt(residual @ residual / max(len(m) - 9, 1)))
+    slope, white = _line(m, grey)
+    residual = grey - (white + slope * m)
+    unexplained, spread = float(residual @ residual) / len(m), float(grey.var())
+    ncc = np.sqrt(max(0.0, 1 - unexplained / max(spread, 1e-9))) * (1 if slope < 0 else -1)
+    noise = float(np.sqrt(unexplained * len(m) / max(len(m) - 9, 1)))
     state = replace(state, black=white + slope, white=white, ncc=float(ncc), noise=noise)
     if last or slope > -1:
         return state
-    gy, gx = np.gradient(ink)
-    laplace = cv2.Laplacian(ink, cv2.CV_32F)[inside]
-    gx, gy = gx[inside], gy[inside]
+    gx, gy = (cv2.Sobel(ink, cv2.CV_32F, *axis, ksize=1, scale=0.5) for axis in ((1, 0), (0, 1)))
+    gx, gy, laplace = gx[inside], gy[inside], cv2.Laplacian(ink, cv2.CV_32F)[inside]
+    edge = np.flatnonzero(gx * gx + gy * gy > 1e-4)  # only these say where the patch is
+    if len(edge) < 12:
+        return state
+    at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
+    gx, gy, dx, dy, m, residual = gx[edge], gy[edge], dx[at_x], dy[at_y, 0], m[edge], residual[edge]
     (a, b), (c, d) = np.linalg.inv(state.A)
-    u, v = (a * dx + b * dy)[inside], (c * dx + d * dy)[inside]
-    stretch = 1 / np.maximum(1 - state.bend[0] * u - state.bend[1] * v, 0.3)  # 1 + bend·u of the true patch point
-    u, v = u * stretch, v * stretch
-    away = gx * (state.A[0, 0] * u + state.A[0, 1] * v) + gy * (state.A[1, 0] * u + state.A[1, 1] * v)
-    ones = np.ones_like(m)
-    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, away * u, away * v)
-    moves = np.stack([ones, m, *(slope * g for g in shifts), laplace * (slope / 2)])
+    u, v, outward = a * dx + b * dy, c * dx + d * dy, gx * dx + gy * dy
+    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace[edge] / 2)
+    moves = np.stack([np.ones_like(m), m, *(slope * g for g in shifts)])
     # pixels that the model cannot explain (shadow edges, rain, what hides the patch) pull less
     usual = 2.5 * 1.48 * float(np.median(np.abs(residual))) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(np.abs(residual), 1e-6))
-    normal = weighted @ moves.T
-    target = weighted @ residual
-    diagonal = np.arange(4, 11)
-    # affine map and blur are damped, as sectors alone leave size and some stretches open
-    normal[diagonal, diagonal] += 1e-3 * normal[diagonal, diagonal] + 1e-3
-    normal[[2, 3], [2, 3]] += 1e-6 * normal[0, 0]
-    prior = (noise**2 + 1) / (BEND * minor) ** 2
+    return _moved(state, weighted @ moves.T, weighted @ residual, minor)
+
+
+def _line(m: Float32, grey: Float32) -> tuple[float, float]:
+    """Slope and offset of the least-squares line of grey over m."""
+    middle = m.mean()
+    centred = m - middle
+    slope = float(centred @ grey) / max(float(centred @ centred), 1e-6)
+    return slope, float(grey.mean() - slope * middle)
+
+
+def _moved(state: _State, normal: Float, target: Float, minor: float) -> _State:
+    """Solve the normal equations of (white, ink, x, y, 4 of A, 2 of bend, blur²) and take the step, within reason."""
+    damped = np.arange(4, 11)  # sectors alone leave size and some stretches open
+    normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
+    normal[[0, 1, 2, 3], [0, 1, 2, 3]] += 1e-3
+    prior = (state.noise**2 + 1) / (BEND * minor) ** 2
     normal[[8, 9], [8, 9]] += prior
     target[8:10] -= prior * state.bend
     delta = np.linalg.solve(normal, target)

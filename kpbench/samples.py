@@ -38,8 +38,11 @@ Float32 = NDArray[np.float32]
 MOST_KEYPOINTS = 12
 VALIDATION_EVERY = 10
 IMAGE_WIDTH_PX = 640  # the image that a crop is thought to be cut from: focal lengths are relative to it
-DETECTABLE = 12.0
-"""Least contrast / noise · √area of a keypoint that is asked for: 6 sigma at the output of a matched filter."""
+ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
+DETECTABLE = 15.0
+"""Least contrast / noise · √area of a keypoint that is asked for: 7.5 sigma at the output of a matched filter."""
+FAINTEST = 4.0
+"""Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of anything fainter."""
 
 
 @dataclass(frozen=True)
@@ -267,21 +270,26 @@ def _crops(
         inside = [d for d in discs[n] if -0.5 <= d.x < width - 0.5 and -0.5 <= d.y < height - 0.5]
         for k, disc in enumerate(inside[:MOST_KEYPOINTS]):
             kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
-            signal = gain * (disc.white - disc.black) * max(kept, 0.0) * np.sqrt(np.pi * disc.major * disc.minor)
-            lost = (
-                signal < DETECTABLE * sigma
-                or disc.minor < 0.5 * Limits().minor_axis_px
-                or any(disc is h for h in hidden)
-            )
+            contrast = gain * (disc.white - disc.black) * max(kept, 0.0)
+            area = np.pi * disc.major * disc.minor
+            buried = contrast < max(FAINTEST, DETECTABLE * sigma / np.sqrt(area))
+            small = disc.minor < 0.5 * Limits().minor_axis_px
+            lost = buried or small or any(disc is h for h in hidden)
             keypoints[n, k] = disc.x, disc.y, disc.place, disc.major if lost else 0.0
     return Batch(images, keypoints)
 
 
-def _window(photo: UInt8, rng: np.random.Generator, width: int, height: int, least: float = 0.5) -> UInt8:
-    """A crop of a photograph, at between ``least`` and all of its size, mirrored half of the time."""
+def _window(
+    photo: UInt8, rng: np.random.Generator, width: int, height: int, zoom: tuple[float, float] | None = None
+) -> UInt8:
+    """A crop of a photograph, mirrored half of the time.
+
+    ``zoom`` is the range of px of the photograph a px of the crop; None: from half the photograph to all of it.
+    """
     rows, columns = photo.shape
     largest = min(columns / width, rows / height)
-    scale = largest * np.exp(rng.uniform(np.log(least), 0.0))
+    least, most = zoom or (0.5 * largest, largest)
+    scale = min(np.exp(rng.uniform(np.log(least), np.log(most))), largest)
     w, h = max(8, int(width * scale)), max(8, int(height * scale))
     x, y = rng.integers(columns - w + 1), rng.integers(rows - h + 1)
     how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
@@ -293,7 +301,7 @@ def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, h
     """Mostly photographs, of any contrast and brightness; now and then an even surface."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
-    image = _window(photos[int(rng.integers(len(photos)))], rng, width, height, least=0.1)
+    image = _window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
     if rng.random() < 0.5:
         middle = rng.uniform(60, 200)
         table = np.clip(middle + rng.uniform(0.4, 1.6) * (np.arange(256) - 127.0), 0, 255).astype(np.uint8)
@@ -353,7 +361,7 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -
     height, width = image.shape
     limits = Limits()
     on_board = rng.random() < 0.5
-    asked = int(rng.choice(5, p=(0.15, 0.4, 0.2, 0.15, 0.1)))
+    asked = int(rng.choice(5, p=(0.3, 0.32, 0.16, 0.13, 0.09)))
     if asked == 0:
         if on_board:
             _paper(image, rng, random_poses(rng, 1, limits)[0] + _shift(rng.uniform(0, width), rng.uniform(0, height)))

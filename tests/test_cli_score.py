@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections
 from kpbench.predictions import Predictions, write_predictions
-from kpbench.score import COUNTS, METRICS
+from kpbench.scoring import COUNTS, METRICS
 from kpbench.store import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_atomic, write_manifest
 
 

@@ -25,11 +25,12 @@ LAYERS = [
     {"match"},
     {"refine"},
     {"detect"},
-    {"score"},
+    {"assignment"},
+    {"scoring"},
     {"report", "preview", "interchange"},
     {"pipeline"},
 ]
-EVALUATOR = {"score", "predictions", "report", "detect", "store", "sources", "preview", "interchange"}
+EVALUATOR = {"assignment", "scoring", "predictions", "report", "detect", "store", "sources", "preview", "interchange"}
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
     *("background", "scene", "degrade", "camera", "synth", "suite", "samples"),

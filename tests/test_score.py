@@ -8,24 +8,12 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-import kpbench
+from kpbench import assignment, scoring
+from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
 from kpbench.errors import DataError, GateFailed, PredictionsError
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
 from kpbench.predictions import Predictions
-from kpbench.score import (
-    CLUTTER,
-    DUPLICATE,
-    MATCHED,
-    METRICS,
-    NEAR_MISS,
-    Settings,
-    check_gates,
-    evaluate,
-    match,
-    score,
-)
-
-score_module = sys.modules["kpbench.score"]  # the package attribute of this name is the function
+from kpbench.scoring import METRICS, Settings, check_gates, evaluate, score
 
 
 def truth_of(images, condition=None, rung=None, scene=None, image_id=None):
@@ -591,12 +579,10 @@ def test_copies_of_an_image_in_its_scene_add_no_certainty():
 def test_many_different_scenes_are_pooled_without_changing_the_width(monkeypatch):
     truth, detections = random_case(np.random.default_rng(3), 400)
     exact = score(truth, detections, resamples=2000).overall.intervals
-    monkeypatch.setattr(score_module, "MOST_KINDS", 5)
-    assert len(score_module._unique_rows(np.array([[0, 1], [2, 3], [0, 1]]))[0]) == 2
-    monkeypatch.setattr(score_module, "MOST_KINDS", 100)
-    monkeypatch.setattr(
-        score_module, "_unique_rows", lambda table: (table[np.lexsort(table.T)], np.ones(len(table), int))
-    )
+    monkeypatch.setattr(scoring, "MOST_KINDS", 5)
+    assert len(scoring._unique_rows(np.array([[0, 1], [2, 3], [0, 1]]))[0]) == 2
+    monkeypatch.setattr(scoring, "MOST_KINDS", 100)
+    monkeypatch.setattr(scoring, "_unique_rows", lambda table: (table[np.lexsort(table.T)], np.ones(len(table), int)))
     pooled = score(truth, detections, resamples=2000).overall.intervals
     for name in ("detection_score", "average_false_alarm", "f1"):
         a, b = exact[name], pooled[name]
@@ -606,7 +592,7 @@ def test_many_different_scenes_are_pooled_without_changing_the_width(monkeypatch
 
 def test_rows_with_counts_too_large_for_one_number_are_told_apart_too():
     table = np.array([[2**31, 2**31, 1], [5, 0, 1], [2**31, 2**31, 1]])
-    kinds, many = score_module._unique_rows(table)
+    kinds, many = scoring._unique_rows(table)
     assert sorted(zip(kinds.tolist(), many.tolist(), strict=True)) == [([5, 0, 1], 1), ([2**31, 2**31, 1], 2)]
 
 
@@ -683,7 +669,7 @@ def test_blocks_of_pairs_give_what_one_block_gives(monkeypatch):
         for _ in range(20)
     ]
     whole = match_of(case, 0.5)
-    monkeypatch.setattr(score_module, "PAIRS_AT_ONCE", 7)
+    monkeypatch.setattr(assignment, "PAIRS_AT_ONCE", 7)
     blocks = match_of(case, 0.5)
     for name in vars(whole):
         np.testing.assert_array_equal(getattr(whole, name), getattr(blocks, name))
@@ -716,15 +702,8 @@ def test_the_flat_table_and_the_file_hold_the_same_numbers():
     assert [row["patch_id"] for row in rows] == [None, 0, 1]
 
 
-def test_the_package_attribute_stays_callable_after_the_module_is_imported():
-    import kpbench.score as module
-
-    assert module is sys.modules["kpbench.score"]
-    assert kpbench.score(truth_of([[]]), [found()], resamples=0).overall.counts["images"] == 1
-
-
 def test_the_evaluator_needs_neither_generator_nor_files():
-    code = "import sys, kpbench.score; print(*sorted(m for m in sys.modules))"
+    code = "import sys, kpbench.scoring; print(*sorted(m for m in sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     heavy = {"h5py", "torch", "onnxruntime", "cv2", "pandas", "pyarrow"}
     ours = {f"kpbench.{name}" for name in ("design", "scene", "degrade", "store", "pipeline", "detect")}

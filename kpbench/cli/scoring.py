@@ -9,7 +9,7 @@ import click
 
 if TYPE_CHECKING:
     from kpbench.predictions import Predictions
-    from kpbench.score import Group, Scores
+    from kpbench.scoring import Group, Scores
     from kpbench.store import Dataset
 
 __all__ = ["score"]
@@ -21,7 +21,7 @@ class Limit(click.ParamType[tuple[str, float]]):
     name = "METRIC=VALUE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        from kpbench.score import METRICS
+        from kpbench.scoring import METRICS
 
         if isinstance(value, tuple):
             return value
@@ -74,8 +74,8 @@ def score(
     """
     from kpbench.errors import PredictionsError
     from kpbench.predictions import read_predictions
-    from kpbench.score import check_gates
-    from kpbench.score import score as score_all
+    from kpbench.scoring import check_gates
+    from kpbench.scoring import score as score_all
 
     predictions = read_predictions(preds)
     dataset = _dataset_of(predictions, preds, gt)

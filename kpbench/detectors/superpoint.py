@@ -152,7 +152,10 @@ def fit_designs(grey: UInt8, found: Detections, patches: Sequence[Patch]) -> Det
         With ``patch_id``; scores and identities are not changed.
     patches : sequence of Patch
     """
-    if not len(found) or found.patch_id is None or min(grey.shape) < 2 * match.RING_PX:
+    if found.patch_id is None or min(grey.shape) < 2 * CELL:
+        return found
+    patches = [patch for patch in patches if patch.patch_id in found.patch_id]
+    if not patches:
         return found
     known = match.bank(patches)
     raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from kpbench import __version__, match, refine
 from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
+from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
 
 __all__ = ["TemplateDetector", "crossings"]
@@ -131,12 +132,24 @@ class TemplateDetector:
     ----------
     patches : the designs to look for.
     threshold : least score of a detection, in [0, 1].
+
+    Raises
+    ------
+    DataError
+        If a design has no edges of two directions at its centre: a whole edge looks like that.
     """
 
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
     threshold: float = 0.3
     name: str = "template"
     version: str = __version__
+
+    def __post_init__(self) -> None:
+        for patch in self.patches:
+            if not patch.centre_is_crossing:
+                raise DataError(
+                    f"design {patch.name!r}: template needs edges of two directions that meet at the centre"
+                )
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
