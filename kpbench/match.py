@@ -290,9 +290,9 @@ def align(levels: Sequence[Float32], poses: Poses, templates: Templates, steps: 
         delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
         delta *= np.minimum(1.0, 0.35 / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
         turn = np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
+        turned = A @ turn
         # sectors have no size: what the templates show of one is their blur, which is no guide
-        turn /= np.where(sized, 1.0, np.sqrt(np.abs(np.linalg.det(turn))))[:, None, None]
-        A = A @ turn
+        A = turned * np.where(sized, 1.0, short_axis(A) / np.maximum(short_axis(turned), 1e-9))[:, None, None]
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])
     return Poses(xy, A, which, ncc.astype(np.float64))
 

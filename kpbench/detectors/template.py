@@ -74,8 +74,8 @@ def crossings(level: Float32) -> tuple[Float, Float]:
     return np.column_stack([columns, rows])[best].astype(np.float64), found[best].astype(np.float64)
 
 
-CORE, LIKENESS, MOST = 0.89, 11.5, 80
-"""Least correlation of a candidate near its centre, least :func:`_likeness`, most candidates of one image."""
+CORE, LIKENESS, MOST = 0.89, 11.7, 80
+"""Least correlation of a candidate near its centre, least :func:`_likeness`, most candidates of 640x480 px."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,11 @@ class Candidates:
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
         relative_blur = np.minimum(self.fit.blur_px / np.maximum(match.short_axis(self.fit.A), 0.5), 1)
         evidence = (
-            -12.26
+            -12.55
             + _likeness(self.core, self.whole)
-            - 0.63 * np.log(np.minimum(unexplained, 3) + 0.02)
-            - 14.16 * relative_blur
-            + 2.81 * np.log(contrast / (self.range + 5))
+            - 0.78 * np.log(np.minimum(unexplained, 3) + 0.02)
+            - 16.64 * relative_blur
+            + 2.46 * np.log(contrast / (self.range + 5))
         )
         sane = (self.fit.white > self.fit.black) & np.isfinite(evidence)
         return np.where(sane, 1 / (1 + np.exp(-np.clip(evidence, -30, 30))), 0.0)
@@ -121,7 +121,7 @@ class Candidates:
 
 def _likeness(core: Float, whole: Float) -> Float:
     """What the two correlations are worth, in units of log odds."""
-    return np.asarray(-2.28 * np.log(1.01 - core) - 2.44 * np.log(1.01 - whole))
+    return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ class TemplateDetector:
             poses = match.align(smooth, poses, known.core, steps, 0.9 * match.RING_PX)
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
-        core = poses[_distinct(poses)[:MOST]]
+        core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
         whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
         sure = _likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
