@@ -1,3 +1,6 @@
+import runpy
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -96,3 +99,13 @@ def test_no_patches_is_a_scene_too():
     assert (rendered.image == 7).all()
     assert len(rendered.keypoints) == 0
     assert rendered.image is not background
+
+
+@pytest.mark.parametrize("patch", FOUR, ids=lambda patch: patch.name)
+def test_an_independent_fit_finds_the_true_centre(patch):
+    """A few of the renders that benchmarks/truth.py measures; its model shares no code with the renderer."""
+    truth = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "truth.py"))
+    measure = truth["measure"]
+    measure.__globals__["SUB"] = 5
+    errors, _ = measure(patch, 2)
+    assert errors.max() < 0.02
