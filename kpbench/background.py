@@ -62,7 +62,8 @@ class PhotoFolder:
         """
         folder = Path(path)
         if not folder.is_dir():
-            raise DataError(f"{folder}: no such folder of background images")
+            what = "a file, expected a folder" if folder.exists() else "no such folder"
+            raise DataError(f"{folder}: {what} of background images")
         files = tuple(
             sorted(f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES)
         )

@@ -331,8 +331,10 @@ def load_patch(path: str | Path) -> Patch:
     """
     try:
         table = tomllib.loads(Path(path).read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DesignError(f"{path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise DesignError(f"{path}: cannot be read, {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise DesignError(f"{path}: cannot be read, not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise DesignError(f"{path}: not valid TOML ({error})") from None
     return parse_patch(table, str(path))

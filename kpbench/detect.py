@@ -77,7 +77,10 @@ def load_detector(name: str) -> LoadedDetector:
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or MODULE:ATTR of your own"
         )
     found = _resolve(DETECTORS.get(name, name))
-    made = found() if isinstance(found, type) else found
+    try:
+        made = found() if isinstance(found, type) else found
+    except Exception as error:
+        raise DataError(f"detector {name!r}: cannot be made, {type(error).__name__}: {one_line(error)}") from None
     run = getattr(made, "detect", made)
     if not callable(run):
         raise DataError(f"detector {name!r}: {made!r} cannot be called and has no method detect(image)")
@@ -93,8 +96,16 @@ def _resolve(path: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     except ModuleNotFoundError as error:
         raise DataError(f"detector {path!r}: there is no module {error.name!r}") from None
-    except AttributeError:
+    except (Exception, SystemExit) as error:
+        if not isinstance(error, AttributeError) or hasattr(sys.modules.get(module), attribute):
+            what = f"{type(error).__name__}: {one_line(error)}"
+            raise DataError(f"detector {path!r}: module {module!r} cannot be imported, {what}") from None
         raise DataError(f"detector {path!r}: module {module!r} has no attribute {attribute!r}") from None
+
+
+def one_line(error: BaseException) -> str:
+    """The text of an error without line breaks."""
+    return " ".join(str(error).split())
 
 
 def to_grey(image: UInt8) -> UInt8:

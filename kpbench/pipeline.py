@@ -7,6 +7,7 @@ import hashlib
 import json
 import platform
 import shutil
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade, store
-from kpbench.detect import LoadedDetector, load_detector
+from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, UInt8
 from kpbench.predictions import Predictions
@@ -322,6 +323,10 @@ def _predicted(
     ids: NDArray[np.int64],
     dataset: store.Dataset | None = None,
 ) -> Predicted:
+    if found and all(said for _, said in found):
+        raise DataError(
+            f"detector {detector.name}: failed on all {len(found)} images, first {labels[0]}: {found[0][1]}"
+        )
     about = {"name": detector.name, "version": detector.version}
     where = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
     predictions = Predictions.from_detections([d for d, _ in found], ids, about, **where)
@@ -332,8 +337,16 @@ def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> 
     try:
         found = detector(image)
     except Exception as error:  # whatever a detector of somebody else raises
-        return Detections.none(), f"{type(error).__name__}: {error}"
+        return Detections.none(), f"{type(error).__name__}: {one_line(error)}{_line_of(error)}"
     return (found if threshold is None else found[found.score >= threshold]), ""
+
+
+def _line_of(error: BaseException) -> str:
+    """Where in the detector's own file an error was raised."""
+    frames = traceback.extract_tb(error.__traceback__)
+    inside = Path(__file__).parent
+    own = [frame for frame in frames if inside not in Path(frame.filename).parents]
+    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 @cache
@@ -359,7 +372,7 @@ def degrade_files(
 
     Parameters
     ----------
-    source : from :func:`kpbench.sources.open_images`; what cannot be decoded is passed over.
+    source : from :func:`kpbench.sources.open_images`; what cannot be decoded is named at the end.
     out : folder; made if it is not there.
     steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
     seed : the n-th image written is a function of the n-th image, the steps, the seed and n.
@@ -372,10 +385,13 @@ def degrade_files(
     Raises
     ------
     DataError
-        If an effect is not known, a level is out of range, or a file cannot be written.
+        If an effect is not known, a level is out of range, a file cannot be written, or, after all others
+        are done, if images could not be decoded.
     """
+    broken = []
     for n, (name, image) in enumerate(source.images):
         if image is None:
+            broken.append(name)
             continue
         if (image == image[..., :1]).all():  # grey, whatever the file's mode
             image = np.ascontiguousarray(image[..., 0])
@@ -390,3 +406,5 @@ def degrade_files(
         packed = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image)[1]
         store.write_atomic(target, packed.tobytes())
         yield target, effects
+    if broken:
+        raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")

@@ -187,8 +187,10 @@ def load_recipe(path: str | Path) -> Recipe:
     """
     try:
         table = tomllib.loads(Path(path).read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: cannot be read, not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise DataError(f"{path}: not valid TOML ({error})") from None
     return parse_recipe(table, str(path))

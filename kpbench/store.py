@@ -386,10 +386,14 @@ def open_dataset(path: str | Path) -> Dataset:
         if any(folder.glob("shard-*.h5")):
             raise DataError(f"{folder}: an unfinished dataset (no {MANIFEST}); finish it with --resume") from None
         raise DataError(f"{folder}: no dataset there (no {MANIFEST}); `kpbench synth` makes one") from None
+    except NotADirectoryError:
+        raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
         raise DataError(f"{folder / MANIFEST}: cannot be read, {error.strerror}") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{folder / MANIFEST}: not a dataset manifest ({error})") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise DataError(
+            f"{folder / MANIFEST}: not a dataset manifest, expected JSON with schema, config, fingerprint and shards"
+        ) from None
     if not dataset.shards:
         raise DataError(f"{folder / MANIFEST}: lists no shards")
     for shard in dataset.shards:

@@ -294,8 +294,10 @@ def load_suite(name: str) -> Suite:
         raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
     try:
         table = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path}: cannot be read ({error})") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path}: cannot be read, not UTF-8 text") from None
     except tomllib.TOMLDecodeError as error:
         raise DataError(f"{path}: not valid TOML ({error})") from None
     try:

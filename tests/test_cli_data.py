@@ -82,3 +82,27 @@ def test_without_a_terminal_stderr_stays_empty(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["score", "preds.json", "--eps", "nan"],
+        ["detect", "photos", "--threshold", "inf"],
+        ["render-patches", "--diameter-mm", "nan"],
+        ["synth", "--n", "5", "--workers", "0"],
+        ["synth", "--n", "5", "--seed", "-1"],
+        ["degrade", "photo.png", "--effect", "blur", "--level", "7", "--seed", "-1"],
+    ],
+)
+def test_numbers_that_are_none_are_wrong_usage(arguments):
+    assert run(*arguments).exit_code == 2
+
+
+def test_a_full_standard_output_is_one_line(dataset):
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "kpbench", "verify", str(dataset)]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "No space left on device" in done.stderr

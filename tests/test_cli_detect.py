@@ -98,12 +98,13 @@ def test_a_video_and_its_overlay(folder, plug):
 def test_an_image_that_fails_is_named_and_counted_and_the_rest_goes_on(folder, plug):
     photos(folder)
     (folder / "photos" / "broken.jpg").write_bytes(b"nothing")
+    cv2.imwrite(str(folder / "photos" / "even.png"), np.full((40, 40, 3), 2, np.uint8))
     result = run("photos", "--detector", f"{plug}:moody")
     assert result.exit_code == 1
     assert "broken.jpg: cannot be decoded" in result.stderr
     assert "0.png: RuntimeError: not today" in result.stderr
     assert "4 images failed" in result.stderr
-    assert len(read_predictions("preds.json")) == 4
+    assert len(read_predictions("preds.json")) == 5
 
 
 @pytest.mark.parametrize(
@@ -135,3 +136,27 @@ def test_predictions_for_another_dataset_are_refused_by_its_fingerprint(folder, 
     assert refused.exit_code == 1
     assert "made for the dataset with fingerprint" in refused.stderr
     assert refused.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "says"),
+    [
+        ("def f(image:\n", "cannot be imported, SyntaxError"),
+        ("raise SystemExit(7)\n", "cannot be imported, SystemExit: 7"),
+        ("class f:\n    def __init__(self, a):\n        pass\n", "cannot be made, TypeError"),
+        (
+            "def f(image):\n    raise ValueError('a\\nb')\n",
+            "failed on all 3 images, first 0.png: ValueError: a b (bad_",
+        ),
+    ],
+)
+def test_mistakes_in_a_detector_of_ones_own_are_one_line_and_keep_older_predictions(folder, code, says):
+    photos(folder)
+    (folder / "preds.json").write_text("earlier")
+    name = f"bad_{abs(hash((str(folder), code)))}"
+    (folder / f"{name}.py").write_text(code)
+    result = run("photos", "--detector", f"{name}:f")
+    assert result.exit_code == 1
+    assert says in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert (folder / "preds.json").read_text() == "earlier"

@@ -257,7 +257,8 @@ def test_the_degrade_command(tmp_path):
     cv2.imwrite(str(source / "deep" / "colour.png"), colour)
     (source / "broken.jpg").write_bytes(b"no image")
     done = run("degrade", source, "--effect", "blur", "--level", 7, "--out", tmp_path / "out")
-    assert done.exit_code == 0, done.output
+    assert done.exit_code == 1
+    assert done.stderr == "kpbench: 1 images cannot be decoded, the others are done: broken.jpg\n"
     assert len(done.stdout.splitlines()) == 2
     got = cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED)
     assert (got == degrade.blur(grey, 7)).all()

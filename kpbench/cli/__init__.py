@@ -53,6 +53,9 @@ class LazyGroup(click.Group):
         except KpbenchError as error:
             click.echo(f"kpbench: {error}", err=True)
             sys.exit(1)
+        except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
+            click.echo(f"kpbench: {error.strerror or error}", err=True)
+            sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
             click.echo(f"kpbench: interrupted{f': {stop}' if str(stop) else ''}", err=True)
             sys.exit(130)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.options import SIZE
+from kpbench.cli.options import SEED, SIZE, WORKERS
 
 __all__ = ["export", "inspect", "preview", "synth", "verify"]
 
@@ -16,13 +16,13 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @click.command()
 @click.option("--n", "n", type=int, required=True, help="Number of images.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-data"), show_default=True)
-@click.option("--seed", type=int, default=0, show_default=True)
+@SEED
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
 @click.option("--size", type=SIZE, default="640x480", show_default=True)
 @click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
 @click.option("--deteriorate", type=click.Choice(["none", "paper"]), default="paper", show_default=True)
 @click.option("--shard-size", type=int, default=500, show_default=True, help="Images a file.")
-@click.option("--workers", type=int, help="Processes; default: one a core.")
+@WORKERS
 @click.option("--resume", is_flag=True, help="Finish an interrupted run.")
 @click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
 def synth(

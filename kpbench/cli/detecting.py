@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.options import FINITE, WORKERS
+
 __all__ = ["detect"]
 
 
@@ -13,9 +15,9 @@ __all__ = ["detect"]
 @click.argument("source")
 @click.option("--detector", "name", default="template", show_default=True, help="A shipped detector, or MODULE:ATTR.")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
-@click.option("--threshold", type=float, help="Drop detections of a lower score.")
+@click.option("--threshold", type=FINITE, help="Drop detections of a lower score.")
 @click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
-@click.option("--workers", type=int, help="Processes, for a dataset; default: one a core.")
+@WORKERS
 def detect(
     source: str, name: str, out: Path, threshold: float | None, overlay: Path | None, workers: int | None
 ) -> None:

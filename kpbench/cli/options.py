@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import click
 
-__all__ = ["SIZE", "Size"]
+__all__ = ["FINITE", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
 
 
 class Size(click.ParamType[tuple[int, int]]):
@@ -24,4 +25,17 @@ class Size(click.ParamType[tuple[int, int]]):
         return width, height
 
 
+class Finite(click.FloatRange):
+    """A number within a range that is neither nan nor infinite, which click lets pass."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number", param, ctx)
+        return number
+
+
 SIZE = Size()
+FINITE = Finite()
+SEED = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Processes; default: one a core.")

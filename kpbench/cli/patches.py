@@ -7,6 +7,8 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.options import Finite
+
 
 class Measured(click.ParamType[tuple[float, float]]):
     """``X_MM,Y_MM`` as a tuple."""
@@ -31,7 +33,7 @@ class Measured(click.ParamType[tuple[float, float]]):
 @click.option("--dxf", is_flag=True, help="DXF in mm with true arcs, for laser and plotter.")
 @click.option(
     "--diameter-mm",
-    type=click.FloatRange(0.1, 5000),
+    type=Finite(0.1, 5000),
     metavar="MM",
     help="Diameter of the disc; rim and quiet zone come on top. A hexagon's side is DIAMETER / 0.16.  [default: 30]",
 )

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from kpbench.cli.options import Finite
+
 if TYPE_CHECKING:
     from kpbench.predictions import Predictions
     from kpbench.scoring import Group, Scores
@@ -45,7 +47,7 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option(
     "--gt", type=click.Path(path_type=Path), help="Dataset; else the one named in PREDS, else ./kpbench-data."
 )
-@click.option("--eps", type=click.FloatRange(min=0), default=0.1, show_default=True, help="Reach of a match, in radii.")
+@click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii.")
 @click.option("--eps-radius", type=click.Choice(["major", "minor", "mean"]), default="major", show_default=True)
 @click.option("--matching", type=click.Choice(["one-to-one", "literal"]), default="one-to-one", show_default=True)
 @click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections.")

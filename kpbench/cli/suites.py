@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.options import SIZE
+from kpbench.cli.options import FINITE, SEED, SIZE, WORKERS
 
 __all__ = ["degrade", "suite"]
 
@@ -32,12 +32,12 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder; default: kpbench-suite/NAME.")
 @click.option("--images", type=int, help="Base scenes, each seen with every patch under every rung; default: 500.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@SEED
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
 @click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
 @click.option("--only", metavar="CONDITION,…", help="Only these conditions, such as scale,blur.")
 @click.option("--distortion", type=Distortion(), help="Lens distortion as OpenCV's coefficients; default: none.")
-@click.option("--workers", type=int, help="Processes; default: one a core.")
+@WORKERS
 @click.option("--resume", is_flag=True, help="Finish an interrupted run.")
 @click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
 def suite(
@@ -73,9 +73,9 @@ def suite(
 @click.option(
     "--effect", "effects", multiple=True, required=True, help="An effect of the ladder; repeatable, in order."
 )
-@click.option("--level", "levels", type=float, multiple=True, required=True, help="Its level; one for each effect.")
+@click.option("--level", "levels", type=FINITE, multiple=True, required=True, help="Its level; one for each effect.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("degraded"), show_default=True, help="Folder.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@SEED
 def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
     """Degrade an image, or all images of a folder, and write them as PNG.
 
