@@ -23,7 +23,10 @@ from kpbench.keypoints import Detections, Float, UInt8
 
 __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
 
-DETECTORS = {"template": "kpbench.detectors.template:TemplateDetector"}
+DETECTORS = {
+    "template": "kpbench.detectors.template:TemplateDetector",
+    "superpoint-small": "kpbench.detectors.superpoint:SmallSuperPointDetector",
+}
 """Name → where the shipped detector is, as ``MODULE:ATTR``."""
 
 

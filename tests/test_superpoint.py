@@ -204,3 +204,25 @@ def test_a_file_that_is_no_model_of_ours_is_one_line(tmp_path, content, message)
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(DataError, match=r"nowhere\.onnx: cannot be read"):
         SuperPointDetector(tmp_path / "nowhere.onnx")
+
+
+def test_the_shipped_weights_find_large_clean_patches():
+    """First weights, little trained: an easy scene, so that a wrong file, frame or channel order is seen."""
+    from kpbench.detect import load_detector
+    from kpbench.scene import Limits
+    from kpbench.synth import SynthConfig
+
+    detect = load_detector("superpoint-small")
+    limits = Limits(count=(4, 4), radius_px=(15, 30), tilt_deg=20, black=(0, 30), white=(220, 255))
+    truths = found = right = 0
+    for n in range(3):
+        sample = SynthConfig(3, seed=4, deteriorate="none", limits=limits).make(n)[0]
+        detections = detect(sample.image)
+        for k in sample.keypoints:
+            distance = np.hypot(*(detections.xy - [k["x"], k["y"]]).T)
+            truths += 1
+            if distance.min() <= 0.1 * k["radius_major"]:
+                found += 1
+                right += int(detections.patch_id[distance.argmin()] == k["patch_id"])
+    assert found >= 0.75 * truths
+    assert right >= 0.75 * found
