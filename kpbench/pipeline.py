@@ -116,7 +116,8 @@ def generate(
             for entry, met in run_pieces(work, todo, workers, progress):
                 results[entry.file] = (entry, met)
         except DataError as error:
-            raise DataError(f"{folder}: {error}; finished shards are kept, add --resume to go on") from None
+            said = str(error) if str(error).startswith(str(folder)) else f"{folder}: {error}"
+            raise DataError(f"{said}; finished shards are kept, add --resume to go on") from None
         entries = [results[name][0] for name, _, _ in plan]
         broken = tuple(sorted({file for _, files in results.values() for file in files}))
         store.write_manifest(folder, written, entries, _provenance(broken))
