@@ -8,6 +8,7 @@ import json
 import platform
 import shutil
 import traceback
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -205,9 +206,13 @@ def _locked(folder: Path) -> Iterator[None]:
 
 def _provenance(broken: tuple[str, ...]) -> dict[str, Any]:
     """Versions that can change pixels, and the broken files; nothing that differs between equal runs."""
-    libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "isal")
+    libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py")
     return {
-        "versions": {"python": platform.python_version(), **{name: metadata.version(name) for name in libraries}},
+        "versions": {
+            "python": platform.python_version(),
+            "zlib": zlib.ZLIB_RUNTIME_VERSION,
+            **{name: metadata.version(name) for name in libraries},
+        },
         "broken_backgrounds": list(broken),
     }
 
