@@ -124,7 +124,7 @@ def encode_shard(samples: Sequence[Sample], config: Mapping[str, Any], broken: S
             "images", (len(samples), *shape), "u1", chunks=(1, *shape), compression="gzip", compression_opts=1
         )
         for n, sample in enumerate(samples):
-            packed = zlib.compress(np.ascontiguousarray(sample.image), DEFLATE_LEVEL)
+            packed = zlib.compress(sample.image.tobytes(), DEFLATE_LEVEL)
             images.id.write_direct_chunk((n, *(0 for _ in shape)), packed)
         text = h5py.string_dtype("utf-8")
 
