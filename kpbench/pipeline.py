@@ -155,9 +155,9 @@ def _prepare(
     pieces = {piece[0]: piece for piece in plan}
     for path in present:
         with store.open_shard(path) as file:
-            if file.attrs["config"] != store.canonical_json(written) or path.name not in pieces:
+            if store.attribute(file, "config") != store.canonical_json(written) or path.name not in pieces:
                 raise DataError(f"{path}: of another dataset than this command makes; use --overwrite or another --out")
-            broken = tuple(json.loads(file.attrs["broken_backgrounds"]))
+            broken = tuple(json.loads(store.attribute(file, "broken_backgrounds")))
         entry = store.ShardEntry(*pieces[path.name], path.stat().st_size, store.sha256_of(path))
         kept[path.name] = (entry, broken)
     return kept

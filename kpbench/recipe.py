@@ -112,7 +112,7 @@ class Recipe:
     warmup : samples over which the learning rate rises from 0.
     schedule : "step" (times ``decay`` at each of ``decay_at``) or "cosine" (down to ``decay`` at the end).
     ema : decay of the running mean of the weights a step; the mean is what is evaluated and exported.
-    precision : "bf16" (autocast) or "fp32".
+    precision : "fp32", or "bf16" (autocast): twice as fast on a GPU or a CPU with AMX, a tenth of the speed on others.
     compile : whether to use ``torch.compile``.
     """
 
@@ -131,7 +131,7 @@ class Recipe:
     decay: float = 0.05
     decay_at: tuple[int, ...] = ()
     ema: float = 0.999
-    precision: str = "bf16"
+    precision: str = "fp32"
     compile: bool = False
 
     def __post_init__(self) -> None:

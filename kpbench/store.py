@@ -114,35 +114,51 @@ def encode_shard(samples: Sequence[Sample], config: Mapping[str, Any], broken: S
         raise ValueError(f"a shard needs images of one shape, got {sorted(shapes)}")
     shape = shapes.pop()
     counts = [len(sample.keypoints) for sample in samples]
-    # v110 file structures carry checksums, so that a flipped byte outside the data is seen on reading
+    # v110 file structures carry checksums, so that a flipped byte outside the data is seen on reading. Only the
+    # heap of variable-length strings has none (and HDF5 can loop for ever over a damaged one): text is of fixed length
     with h5py.File.in_memory(libver=("v110", "v110")) as file:
-        file.attrs["schema"] = SCHEMA
+        attributes = {
+            "schema": SCHEMA,
+            "config": canonical_json(config),
+            "broken_backgrounds": canonical_json(list(broken)),
+        }
+        for name, text in attributes.items():
+            file.attrs.create(name, text.encode(), dtype=_text_type([text.encode()]))
         file.attrs["version"] = 1
-        file.attrs["config"] = canonical_json(config)
-        file.attrs["broken_backgrounds"] = canonical_json(list(broken))
         images = file.create_dataset(
             "images", (len(samples), *shape), "u1", chunks=(1, *shape), compression="gzip", compression_opts=1
         )
         for n, sample in enumerate(samples):
             packed = zlib.compress(sample.image.tobytes(), DEFLATE_LEVEL)
             images.id.write_direct_chunk((n, *(0 for _ in shape)), packed)
-        text = h5py.string_dtype("utf-8")
 
-        def column(name: str, values: Any, dtype: Any) -> None:
-            values = np.asarray(values, object if dtype is text else dtype)
-            checked = {"chunks": values.shape, "fletcher32": True} if values.size and dtype is not text else {}
-            file.create_dataset(name, data=values, dtype=dtype, **checked)
+        def column(name: str, values: NDArray[Any], **compression: Any) -> None:
+            checked = {"chunks": values.shape, "fletcher32": True, **compression} if values.size else {}
+            file.create_dataset(name, data=values, **checked)
 
-        column("image_id", [sample.image_id for sample in samples], "<i8")
-        column("scene_id", [_scene(sample) for sample in samples], "<i8")
-        column("condition", [sample.condition for sample in samples], text)
-        column("rung", [sample.rung for sample in samples], "<f8")
-        column("offsets", np.concatenate([[0], np.cumsum(counts)]), "<i8")
-        column("keypoints", np.concatenate([sample.keypoints for sample in samples]), KEYPOINT_DTYPE)
-        column("degradations", [canonical_json(sample.effects) for sample in samples], text)
-        column("background", [sample.background for sample in samples], text)
+        def texts(name: str, values: Sequence[str]) -> None:
+            column(name, _fixed_text(values), compression="gzip", compression_opts=1)
+
+        column("image_id", np.array([sample.image_id for sample in samples], "<i8"))
+        column("scene_id", np.array([_scene(sample) for sample in samples], "<i8"))
+        texts("condition", [sample.condition for sample in samples])
+        column("rung", np.array([sample.rung for sample in samples], "<f8"))
+        column("offsets", np.concatenate([[0], np.cumsum(counts)]).astype("<i8"))
+        column("keypoints", np.concatenate([sample.keypoints for sample in samples]).astype(KEYPOINT_DTYPE))
+        texts("degradations", [canonical_json(sample.effects) for sample in samples])
+        texts("background", [sample.background for sample in samples])
         file.flush()
         return bytes(file.id.get_file_image())
+
+
+def _text_type(packed: Sequence[bytes]) -> Any:
+    """HDF5's type of UTF-8 text of a fixed length that holds all of these."""
+    return h5py.string_dtype("utf-8", max(len(text) for text in [b"-", *packed]))
+
+
+def _fixed_text(values: Sequence[str]) -> NDArray[Any]:
+    packed = [value.encode() for value in values]
+    return np.array(packed, _text_type(packed))
 
 
 def _scene(sample: Sample) -> int:
@@ -203,6 +219,11 @@ def _reading(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: damaged or no kpbench shard ({' '.join(str(error).split())[:160]})") from None
 
 
+def attribute(file: Any, name: str) -> str:
+    """A text attribute of an open shard."""
+    return np.bytes_(file.attrs[name]).decode()
+
+
 def open_shard(path: Path) -> Any:
     """Open a shard after checking that it is what it says: plain local data of believable size.
 
@@ -224,15 +245,16 @@ def open_shard(path: Path) -> Any:
 
 
 def _check_shard(file: Any, size: int) -> None:
-    if file.attrs["schema"] != SCHEMA:
-        raise ValueError(f"schema is {file.attrs['schema']!r}, expected {SCHEMA!r}")
+    schema = attribute(file, "schema")
+    if schema != SCHEMA:
+        raise ValueError(f"schema is {schema!r}, expected {SCHEMA!r}")
     count = -1
     for name in COLUMNS:
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):
             raise ValueError(f"/{name} is missing or a link to elsewhere")
         data = file[name]
-        if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
-            raise ValueError(f"/{name} is not stored in this file")
+        if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.hasobject:
+            raise ValueError(f"/{name} is not plain data stored in this file")
         plan = data.id.get_create_plist()
         filters = {plan.get_filter(n)[0] for n in range(plan.get_nfilters())}
         if not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}:
@@ -329,7 +351,7 @@ class Dataset:
         for n, shard in enumerate(self.shards):
             with _reading(self.path / shard.file):
                 data = self._shard(n)[name]
-                parts.append(data.asstr()[:].astype(str) if data.dtype.kind == "O" else data[:])
+                parts.append(data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:])
         return parts
 
     def _column(self, name: str) -> NDArray[Any]:
