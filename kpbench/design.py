@@ -9,6 +9,7 @@ chequer: rings between the radii, sectors between the angles, each cell black or
 from __future__ import annotations
 
 import hashlib
+import itertools
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -341,20 +342,30 @@ def load_patch(path: str | Path) -> Patch:
 
 
 def load_patches(paths: Sequence[str | Path]) -> tuple[Patch, ...]:
-    """Read several design files, in order of their ids.
+    """Read several design files, in order of their ids; a folder stands for the .toml files in it.
 
     Raises
     ------
     DesignError
-        As :func:`load_patch`, or if two designs share an id.
+        As :func:`load_patch`, or if two designs share an id, or if a folder holds none.
     """
     patches: dict[int, tuple[str | Path, Patch]] = {}
-    for path in paths:
+    for path in itertools.chain.from_iterable(map(_design_files, paths)):
         patch = load_patch(path)
         if patch.patch_id in patches:
             raise DesignError(f"{path}: id {patch.patch_id} is taken by {patches[patch.patch_id][0]}")
         patches[patch.patch_id] = (path, patch)
     return tuple(patches[key][1] for key in sorted(patches))
+
+
+def _design_files(path: str | Path) -> list[Path]:
+    folder = Path(path)
+    if not folder.is_dir():
+        return [folder]
+    files = sorted(folder.glob("*.toml"))
+    if not files:
+        raise DesignError(f"{folder}: no designs in it, expected files ending in .toml")
+    return files
 
 
 @lru_cache(maxsize=1)

@@ -54,6 +54,23 @@ def test_bad_input_is_one_line_and_exit_code_1(arguments, says, tmp_path, monkey
     assert result.stderr.count("\n") == 1
 
 
+def test_designs_of_ones_own(tmp_path):
+    design = 'name = "half"\nid = 7\nsemicircles = [{ start_deg = 90, ink = "black" }]\n'
+    (tmp_path / "half.toml").write_text(design)
+    for given in (tmp_path, tmp_path / "half.toml"):
+        result = run(
+            "synth", "--n", 4, "--size", "160x120", "--patches", given, "--out", tmp_path / "set", "--overwrite"
+        )
+        assert result.exit_code == 0, result.output
+        told = run("inspect", tmp_path / "set").stdout
+        assert ", id 7: " in told
+        assert told.count(", id ") == 1
+    (tmp_path / "empty").mkdir()
+    refused = run("synth", "--n", 4, "--patches", tmp_path / "empty", "--out", tmp_path / "other")
+    assert refused.exit_code == 1
+    assert "empty: no designs in it" in refused.stderr
+
+
 def test_a_second_synth_into_the_folder_changes_nothing(dataset):
     before = (dataset / "dataset.json").read_bytes()
     result = run("synth", "--n", 7, "--out", dataset)

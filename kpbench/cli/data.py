@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.options import SEED, SIZE, WORKERS
+from kpbench.cli.options import PATCHES, SEED, SIZE, WORKERS
 
 __all__ = ["export", "inspect", "preview", "synth", "verify"]
 
@@ -18,6 +18,7 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-data"), show_default=True)
 @SEED
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@PATCHES
 @click.option("--size", type=SIZE, default="640x480", show_default=True)
 @click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
 @click.option("--deteriorate", type=click.Choice(["none", "paper"]), default="paper", show_default=True)
@@ -30,6 +31,7 @@ def synth(
     out: Path,
     seed: int,
     backgrounds: Path | None,
+    patches: tuple[Path, ...],
     size: tuple[int, int],
     channels: int,
     deteriorate: str,
@@ -41,13 +43,24 @@ def synth(
     """Write N synthetic labelled images into a dataset folder.
 
     \b
-    Example:
+    Examples:
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
+      kpbench synth --n 500 --patches mine.toml --patches other.toml --out own-designs
     """
     from kpbench.cli.progress import write_dataset
+    from kpbench.design import load_patches, shipped_patches
     from kpbench.synth import SynthConfig
 
-    config = SynthConfig(n, seed, size, channels, deteriorate, shard_size, backgrounds)
+    config = SynthConfig(
+        n=n,
+        seed=seed,
+        size_px=size,
+        channels=channels,
+        deteriorate=deteriorate,
+        shard_size=shard_size,
+        backgrounds=backgrounds,
+        patches=load_patches(patches) if patches else shipped_patches(),
+    )
     write_dataset(config, out, workers, resume, overwrite, "synth")
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import click
 
-__all__ = ["FINITE", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
+__all__ = ["FINITE", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
 
 
 class Size(click.ParamType[tuple[int, int]]):
@@ -39,3 +40,10 @@ SIZE = Size()
 FINITE = Finite()
 SEED = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Processes; default: one a core.")
+PATCHES = click.option(
+    "--patches",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="FILE|DIR",
+    help="Your own design (TOML), or a folder of them; repeatable. Default: the shipped four.",
+)
