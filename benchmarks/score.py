@@ -20,7 +20,8 @@ import numpy as np
 
 from kpbench.keypoints import KEYPOINT_DTYPE, Truth
 from kpbench.predictions import Predictions, read_predictions, write_predictions
-from kpbench.scoring import Settings, evaluate
+from kpbench.scoring import evaluate
+from kpbench.tally import Settings
 
 KEYPOINTS, CONDITIONS, RUNGS = 5, 5, 4
 

@@ -7,8 +7,8 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections
+from kpbench.metrics import COUNTS, METRICS
 from kpbench.predictions import Predictions, write_predictions
-from kpbench.scoring import COUNTS, METRICS
 from kpbench.store import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_atomic, write_manifest
 
 
@@ -83,17 +83,11 @@ def test_undefined_is_na_and_the_printed_reading_is_shown_where_it_differs(here)
         "detection score                0.25"
     )
     assert next(line for line in lines if line.startswith("detection score, as")).split()[4] == "0.5000"
-    assert rows["blur", "1", "all"][4:] == [
-        "0.0000",
-        "[0.0000,",
-        "0.0000]",
-        "n/a",
-        *["0.0000", "[0.0000,", "0.0000]"] * 3,
-        "n/a",
-    ]
+    zero = ["0.0000", "[0.0000,", "0.0000]"]
+    assert rows["blur", "1", "all"][4:] == ["2", "2", *zero, "n/a", *zero * 3, "n/a"]
     assert list(rows) == [
         ("blur", "0", "all"), ("blur", "1", "all"), ("blur", "0", "0"), ("blur", "0", "1"), ("blur", "1", "0"),
-        ("blur", "1", "1"), ("all", "all", "0"), ("all", "all", "1"),
+        ("blur", "1", "1"), ("all", "all", "0"), ("all", "all", "1"), ("all", "all", "all"),
     ]  # fmt: skip
     literal = kpbench("p.json", "--matching", "literal").stdout
     assert "detection score                0.5000" in literal
@@ -115,7 +109,8 @@ def test_files_hold_what_the_screen_shows(here):
     assert tuple(content["metrics"]["counts"]) == COUNTS
     assert content["metrics"]["detection_score"] == 1
     assert content["by"][0]["condition"] == "blur"
-    assert content["provenance"]["predictions"] == {"file": "p.json", "sha256": sha256_of(here / "p.json")}
+    assert content["provenance"]["predictions"] == [{"file": "p.json", "sha256": sha256_of(here / "p.json")}]
+    assert content["provenance"]["dataset"] == {"path": "kpbench-data", "fingerprint": data.fingerprint}
     with (here / "s.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1 + len(content["by"])

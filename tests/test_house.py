@@ -26,11 +26,18 @@ LAYERS = [
     {"refine"},
     {"detect"},
     {"assignment"},
+    {"metrics", "bootstrap"},
+    {"tally"},
     {"scoring"},
-    {"report", "preview", "interchange"},
+    {"breakpoints", "charts", "gallery", "paper", "preview", "tables"},
+    {"exhibits", "interchange"},
+    {"report"},
     {"pipeline"},
 ]
-EVALUATOR = {"assignment", "scoring", "predictions", "report", "detect", "store", "sources", "preview", "interchange"}
+EVALUATOR = {
+    *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "detect", "store", "sources"),
+    *("breakpoints", "charts", "exhibits", "gallery", "interchange", "paper", "preview", "report", "tables"),
+}
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
     *("background", "scene", "degrade", "camera", "synth", "suite", "samples"),

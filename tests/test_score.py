@@ -8,12 +8,14 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from kpbench import assignment, scoring
+from kpbench import assignment, bootstrap
 from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
 from kpbench.errors import DataError, GateFailed, PredictionsError
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.metrics import METRICS
 from kpbench.predictions import Predictions
-from kpbench.scoring import METRICS, Settings, check_gates, evaluate, score
+from kpbench.scoring import check_gates, evaluate, score
+from kpbench.tally import Settings
 
 
 def truth_of(images, condition=None, rung=None, scene=None, image_id=None):
@@ -579,10 +581,10 @@ def test_copies_of_an_image_in_its_scene_add_no_certainty():
 def test_many_different_scenes_are_pooled_without_changing_the_width(monkeypatch):
     truth, detections = random_case(np.random.default_rng(3), 400)
     exact = score(truth, detections, resamples=2000).overall.intervals
-    monkeypatch.setattr(scoring, "MOST_KINDS", 5)
-    assert len(scoring._unique_rows(np.array([[0, 1], [2, 3], [0, 1]]))[0]) == 2
-    monkeypatch.setattr(scoring, "MOST_KINDS", 100)
-    monkeypatch.setattr(scoring, "_unique_rows", lambda table: (table[np.lexsort(table.T)], np.ones(len(table), int)))
+    monkeypatch.setattr(bootstrap, "MOST_KINDS", 5)
+    assert len(bootstrap._unique_rows(np.array([[0, 1], [2, 3], [0, 1]]))[0]) == 2
+    monkeypatch.setattr(bootstrap, "MOST_KINDS", 100)
+    monkeypatch.setattr(bootstrap, "_unique_rows", lambda table: (table[np.lexsort(table.T)], np.ones(len(table), int)))
     pooled = score(truth, detections, resamples=2000).overall.intervals
     for name in ("detection_score", "average_false_alarm", "f1"):
         a, b = exact[name], pooled[name]
@@ -592,7 +594,7 @@ def test_many_different_scenes_are_pooled_without_changing_the_width(monkeypatch
 
 def test_rows_with_counts_too_large_for_one_number_are_told_apart_too():
     table = np.array([[2**31, 2**31, 1], [5, 0, 1], [2**31, 2**31, 1]])
-    kinds, many = scoring._unique_rows(table)
+    kinds, many = bootstrap._unique_rows(table)
     assert sorted(zip(kinds.tolist(), many.tolist(), strict=True)) == [([5, 0, 1], 1), ([2**31, 2**31, 1], 2)]
 
 

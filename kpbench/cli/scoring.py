@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
     from kpbench.predictions import Predictions
-    from kpbench.scoring import Group, Scores
+    from kpbench.scoring import Scores
     from kpbench.store import Dataset
 
 __all__ = ["score"]
@@ -23,7 +24,7 @@ class Limit(click.ParamType[tuple[str, float]]):
     name = "METRIC=VALUE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        from kpbench.scoring import METRICS
+        from kpbench.metrics import METRICS
 
         if isinstance(value, tuple):
             return value
@@ -53,6 +54,9 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections.")
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row a condition, rung and patch.")
+@click.option(
+    "--report", "report_file", type=FILE, help="Write tables and charts: .html (one offline page), .md, .tex."
+)
 @click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
 @click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")
 def score(
@@ -64,6 +68,7 @@ def score(
     allow_missing: bool,
     json_file: Path | None,
     csv_file: Path | None,
+    report_file: Path | None,
     least: tuple[tuple[str, float], ...],
     most: tuple[tuple[str, float], ...],
 ) -> None:
@@ -72,13 +77,18 @@ def score(
     \b
     Examples:
       kpbench score preds.json
+      kpbench score preds.json --report report.html
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
     from kpbench.errors import PredictionsError
     from kpbench.predictions import read_predictions
+    from kpbench.report import WRITERS, provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
     from kpbench.scoring import score as score_all
+    from kpbench.store import write_atomic
 
+    if report_file and report_file.suffix.lower() not in WRITERS:
+        raise click.UsageError(f"--report {report_file}: expected a file ending in {', '.join(WRITERS)}")
     predictions = read_predictions(preds)
     dataset = _dataset_of(predictions, preds, gt)
     try:
@@ -87,15 +97,26 @@ def score(
         )
     except PredictionsError as error:
         raise PredictionsError(f"{preds} does not fit {dataset.path}: {error}") from None
+    known = provenance(dataset, [preds], ["kpbench", *sys.argv[1:]])
     if json_file:
-        _write_json(json_file, scores, preds, dataset)
+        write_atomic(json_file, scores_file(scores, known))
     if csv_file:
-        _write_csv(csv_file, scores)
-    name = " ".join(str(scores.detector[key]) for key in ("name", "version") if scores.detector.get(key))
-    click.echo(f"predictions  {preds}{f', {name}' if name else ''}")
+        write_atomic(csv_file, scores_csv(scores, known))
+    if report_file:
+        _write_report(report_file, scores, dataset, known)
+    click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
     click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
-    click.echo(_table(scores))
+    click.echo(_summary(scores))
     check_gates(scores, dict(least), dict(most))
+
+
+def _write_report(path: Path, scores: Scores, dataset: Dataset, known: dict[str, Any]) -> None:
+    from kpbench.gallery import worst_cases
+    from kpbench.report import Report, write_report
+
+    pictures = path.suffix.lower() == ".html"
+    cases = (worst_cases(scores.tally, dataset.image),) if pictures else ()
+    write_report(path, Report((scores,), dataset.config, cases, known, f"{scores.name} on {dataset.path.name}"))
 
 
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset:
@@ -122,81 +143,16 @@ def _is_fingerprint(text: str) -> bool:
     return len(text) == 64 and set(text) <= set("0123456789abcdef")
 
 
-def _write_json(path: Path, scores: Scores, preds: Path, dataset: Dataset) -> None:
-    from importlib.metadata import version
+def _summary(scores: Scores) -> str:
+    """What the terminal shows."""
+    from kpbench.exhibits import group_table
+    from kpbench.metrics import LABELS, PAPER_METRICS
+    from kpbench.tables import Estimate, Table, cell_text, to_plain
 
-    import orjson
-
-    from kpbench import __version__
-    from kpbench.store import sha256_of, write_atomic
-
-    provenance = {
-        "kpbench": __version__,
-        "predictions": {"file": str(preds), "sha256": sha256_of(preds)},
-        "dataset": str(dataset.path),
-        "versions": {name: version(name) for name in ("numpy", "scipy")},
-    }
-    content = scores.to_dict() | {"provenance": provenance}
-    write_atomic(path, orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE))
-
-
-def _write_csv(path: Path, scores: Scores) -> None:
-    import csv
-    import io
-
-    from kpbench.store import write_atomic
-
-    rows = scores.rows()
-    text = io.StringIO()
-    table = csv.DictWriter(text, rows[0], lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    write_atomic(path, text.getvalue().encode())
-
-
-# --- the table on the terminal ----------------------------------------------------------------------------------
-
-LABELS = {
-    "detection_score": "detection score",
-    "id_matching_score": "ID matching score",
-    "average_false_alarm": "false alarms an image",
-    "detection_score_literal": "detection score, as printed",
-    "id_matching_score_literal": "ID matching score, as printed",
-    "average_false_alarm_literal": "false alarms, as printed",
-    "precision": "precision",
-    "recall": "recall",
-    "f1": "F1",
-    "average_precision": "average precision",
-    "error_median_px": "error, median (px)",
-    "error_p95_px": "error, 95th percentile (px)",
-    "error_rms_px": "error, RMS (px)",
-    "error_median_radii": "error, median (radii)",
-    "error_p95_radii": "error, 95th percentile (radii)",
-    "error_rms_radii": "error, RMS (radii)",
-}
-PAPER = ("detection_score", "id_matching_score", "average_false_alarm")
-
-
-def _number(value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.4f}"
-
-
-def _with_interval(group: Group, name: str) -> str:
-    interval = group.intervals.get(name)
-    text = _number(group.metrics[name])
-    return text if interval is None else f"{text} [{interval[0]:.4f}, {interval[1]:.4f}]"
-
-
-def _count(value: int | None) -> str:
-    return "n/a" if value is None else str(value)
-
-
-def _table(scores: Scores) -> str:
     overall, settings = scores.overall, scores.settings
-    groups = (overall, *scores.by)
     # What the paper's formulas give as printed is shown wherever it differs
-    printed = [name for name in PAPER if any(g.metrics[name] != g.metrics[f"{name}_literal"] for g in groups)]
-    n = {name: _count(value) for name, value in overall.counts.items()}
+    same = [m for m in PAPER_METRICS if all(g.metrics[m] == g.metrics[f"{m}_literal"] for g in (overall, *scores.by))]
+    n = {name: cell_text(value) for name, value in overall.counts.items()}
     lines = [
         f"match        at most {settings.eps:g} of the {settings.eps_radius} radius, {settings.matching}",
         f"images       {n['images']} in {n['scenes']} scenes, which the 95 % intervals resample",
@@ -205,27 +161,15 @@ def _table(scores: Scores) -> str:
         f"{n['near_miss']} near misses, {n['clutter']} clutter",
         "",
     ]
-    hidden = {f"{name}_literal" for name in PAPER if name not in printed}
-    lines += [f"{label:<30} {_with_interval(overall, name)}" for name, label in LABELS.items() if name not in hidden]
+    for name, label in LABELS.items():
+        if name not in {f"{m}_literal" for m in same}:
+            estimate = Estimate(overall.metrics[name], overall.intervals.get(name))
+            lines.append(f"{label:<30} {cell_text(estimate, 4)}")
     if scores.confusion and any(sum(row) for row in scores.confusion["matrix"]):
+        ids = [str(i) for i in scores.confusion["ids"]]
+        matrix = tuple((i, *row) for i, row in zip(ids, scores.confusion["matrix"], strict=True))
         lines += ["", "ID of matched detections: true in rows, detected in columns"]
-        lines += _aligned(
-            [["", *map(str, scores.confusion["ids"]), "other"]]
-            + [
-                [str(true), *map(str, row)]
-                for true, row in zip(scores.confusion["ids"], scores.confusion["matrix"], strict=True)
-            ]
-        )
+        lines.append(to_plain(Table("", ("", *ids, "other"), matrix)))
     if scores.by:
-        columns = [*PAPER, *(f"{name}_literal" for name in printed), "error_median_px"]
-        rows = [["condition", "rung", "patch", "images", *(LABELS[name] for name in columns)]]
-        for g in scores.by:
-            key = ["all" if part is None else f"{part}" for part in (g.condition, g.rung, g.patch_id)]
-            rows.append([*key, _count(g.counts["images"]), *(_with_interval(g, name) for name in columns)])
-        lines += ["", *_aligned(rows)]
+        lines += ["", to_plain(group_table(scores.by, "", errors=["error_median_px"]), 4)]
     return "\n".join(lines)
-
-
-def _aligned(rows: list[list[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]

@@ -1,0 +1,74 @@
+"""95 % intervals from a bootstrap over scenes: images of one scene are not independent, so scenes are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.keypoints import Float
+
+__all__ = ["Interval", "by_scene", "intervals"]
+
+Int = NDArray[np.int64]
+Interval = tuple[float, float]
+MOST_KINDS = 4000  # different scenes that a bootstrap tells apart
+
+
+def by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
+    """Sums of shape (N, M) of images, added up within scenes: (C, M), in the order of the scenes' numbers."""
+    order = np.argsort(scene, kind="stable")
+    starts = np.flatnonzero(np.append(True, np.diff(scene[order]) != 0)[: len(order)])
+    return sums if len(starts) == len(sums) else np.add.reduceat(sums[order], starts)
+
+
+def intervals(
+    sums: NDArray[Any], statistics: Callable[[Float], Mapping[str, Float]], resamples: int, seed: int
+) -> dict[str, Interval | None]:
+    """Percentile intervals of statistics of the summed rows, when rows are drawn with replacement.
+
+    Drawing C scenes with replacement is drawing how often each *kind* of scene (equal sums) comes up, a multinomial;
+    so a million scenes cost as much as the few hundred different ones among them.
+
+    Parameters
+    ----------
+    sums : ndarray of shape (C, M), a row a scene, whole numbers.
+    statistics : function
+        From (..., M) sums to named values of shape (...), nan where undefined.
+    resamples : int
+        None at all gives no intervals.
+    seed : int
+
+    Returns
+    -------
+    dict of str to (low, high) or None
+        None where there are fewer than two scenes, or where the value is undefined in all resamples.
+    """
+    if len(sums) < 2 or not resamples:
+        return dict.fromkeys(statistics(sums.sum(axis=0)))
+    kinds, many = _unique_rows(sums)
+    rng = np.random.default_rng(seed)
+    if len(kinds) > MOST_KINDS:  # pool scenes at random: the sums of equal-sized pools vary as much
+        shuffled = np.repeat(kinds, many, axis=0)[rng.permutation(len(sums))]
+        kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
+        many = np.ones(MOST_KINDS, np.int64)
+    drawn = rng.multinomial(many.sum(), many / many.sum(), size=resamples)
+    result: dict[str, Interval | None] = {}
+    for name, values in statistics(drawn.astype(float) @ kinds).items():
+        values = values[np.isfinite(values)]
+        low, high = np.percentile(values, [2.5, 97.5]).tolist() if len(values) else (np.nan, np.nan)
+        result[name] = (low, high) if len(values) else None
+    return result
+
+
+def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:
+    """The different rows of a table of whole numbers, in a fixed order, and how often each is there."""
+    least = table.min(axis=0)
+    sizes = (table.max(axis=0) - least).astype(object) + 1
+    if np.prod(sizes) >= 2**62:
+        return np.unique(table, axis=0, return_counts=True)
+    code = np.ravel_multi_index(tuple((table - least).T), tuple(int(size) for size in sizes))
+    _, first, many = np.unique(code, return_index=True, return_counts=True)
+    return table[first], many

@@ -1,0 +1,105 @@
+"""The tables of the paper (arXiv:2410.00521) as data, to be set beside ours.
+
+Its suite was photographed, ours is simulated; every table that shows both says so in its header.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from kpbench.metrics import PAPER_METRICS
+
+__all__ = ["PAPER", "PaperTable", "paper_value"]
+
+Row = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class PaperTable:
+    """One experiment: a value a rung for each of the paper's three metrics.
+
+    ``condition`` and ``rungs`` are those of the suite ``paper-v1``; ``images`` says how the paper's images were made.
+    """
+
+    number: int
+    condition: str
+    title: str
+    unit: str
+    rungs: tuple[float, ...]
+    detection_score: Row
+    id_matching_score: Row
+    average_false_alarm: Row
+    images: str = "photographs"
+
+
+PAPER = {
+    table.condition: table
+    for table in (
+        PaperTable(
+            3,
+            "scale",
+            "Board's share of the image",
+            "%",
+            (0.5, 1, 2, 4, 8, 16, 32),
+            (1, 1, 1, 1, 1, 1, 0.999),
+            (1, 1, 1, 1, 1, 1, 1),
+            (0, 0.436, 0.246, 1.032, 0.164, 0.715, 0.533),
+        ),
+        PaperTable(
+            4,
+            "pitch",
+            "Pitch",
+            "°",
+            (0, 10, 20, 30, 40, 50, 60),
+            (1, 0.999, 0.996, 1, 1, 1, 1),
+            (1, 1, 1, 1, 1, 1, 1),
+            (0.344, 0.486, 0.3385, 0.569, 0.592, 0.245, 0.284),
+        ),
+        PaperTable(
+            5,
+            "blur",
+            "Blur kernel",
+            "px",
+            (3, 7, 11, 15),
+            (1, 0.986, 0.882, 0.605),
+            (1, 1, 1, 1),
+            (0.257, 0.266, 0.111, 0.034),
+        ),
+        PaperTable(
+            6,
+            "dimming",
+            "Dimming k",
+            "",
+            (10, 20, 30, 40),
+            (1, 1, 0.988, 0.783),
+            (1, 1, 1, 1),
+            (0.037, 0, 0, 0),
+        ),
+        PaperTable(
+            7,
+            "noise",
+            "Gaussian noise",
+            "grey levels",
+            (15, 30, 45, 60),
+            (1, 0.872, 0.332, 0.071),
+            (1, 0.998, 0.892, 0),
+            (0.916, 0.302, 0.296, 0.556),
+        ),
+    )
+}
+"""Tables 3 to 7 by condition."""
+
+SYNTHETIC = {
+    "none": dict(zip(PAPER_METRICS, (0.985, 0.999, 0.379), strict=True)),
+    "paper": dict(zip(PAPER_METRICS, (0.950, 0.993, 0.727), strict=True)),
+}
+"""Table 2, the synthetic validation set, by ``kpbench synth --deteriorate``: without and with deterioration."""
+
+
+def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:
+    """What the paper reports, or None where it does not."""
+    table = PAPER.get(condition or "")
+    if table is None or rung not in table.rungs or metric not in PAPER_METRICS:
+        return None
+    row: Row = getattr(table, metric)
+    return row[table.rungs.index(rung)]

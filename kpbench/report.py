@@ -1,0 +1,305 @@
+"""Scores of one or several detectors on one dataset as a report: HTML in one offline file, Markdown, LaTeX.
+
+:func:`sections` says what is in a report; each writer only says how it looks.
+"""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from kpbench.breakpoints import breakpoints
+from kpbench.charts import STYLE
+from kpbench.errors import DataError
+from kpbench.exhibits import (
+    Figure,
+    breakpoint_table,
+    condition_table,
+    confusion_table,
+    count_table,
+    group_table,
+    overview_table,
+    paper_table,
+    precision_recall_chart,
+    radius_chart,
+    severity_chart,
+    synthetic_table,
+    taxonomy_charts,
+)
+from kpbench.paper import PAPER
+from kpbench.scoring import Scores
+from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
+
+if TYPE_CHECKING:
+    from kpbench.gallery import Case
+    from kpbench.store import Dataset
+
+__all__ = [
+    "Report",
+    "Section",
+    "provenance",
+    "scores_csv",
+    "scores_file",
+    "sections",
+    "to_html",
+    "to_latex_report",
+    "to_markdown_report",
+    "write_report",
+]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a report is made of.
+
+    Attributes
+    ----------
+    runs : tuple of Scores
+        One or more detectors on the same truth.
+    config : mapping
+        The dataset's, which says how its images were made and what the patches are called; may be empty.
+    cases : tuple of tuples of Case
+        For each run the images to show; may be empty.
+    provenance : mapping
+        Versions, command, fingerprints.
+    title : str
+    """
+
+    runs: tuple[Scores, ...]
+    config: Mapping[str, Any] = field(default_factory=dict)
+    cases: tuple[tuple[Case, ...], ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    title: str = "kpbench report"
+
+    @property
+    def images(self) -> str:
+        """How the images were made: "simulated", or "" where the dataset does not say."""
+        return "simulated" if self.config.get("kind") in ("suite", "synth") else ""
+
+    @property
+    def patch_names(self) -> dict[int, str]:
+        """Names of the patches by ID, where the dataset tells them."""
+        return {int(patch["id"]): str(patch["name"]) for patch in self.config.get("patches", ())}
+
+
+@dataclass(frozen=True)
+class Gallery:
+    """Pictures of one detector's failures."""
+
+    name: str
+    cases: tuple[Case, ...]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A headline, a sentence or two, and tables, figures and pictures."""
+
+    title: str
+    lead: str
+    blocks: tuple[Table | Figure | Gallery, ...]
+
+
+def sections(report: Report) -> Iterator[Section]:
+    """Everything in a report, in order."""
+    runs, patches = report.runs, report.patch_names
+    settings = runs[0].settings
+    yield Section(
+        "Overview",
+        f"A detection matches a keypoint at most {settings.eps:g} of its {settings.eps_radius} radius away "
+        f"({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
+        (overview_table(runs), count_table(runs), *taxonomy_charts(runs)),
+    )
+    conditions = list(dict.fromkeys(name for run in runs for name in run.conditions))
+    known = [PAPER[name] for name in conditions if name in PAPER]
+    if known or report.config.get("kind") == "synth":
+        tables = [paper_table(runs, table, report.images or "the user's") for table in known]
+        if report.config.get("kind") == "synth":
+            tables.append(synthetic_table(runs, str(report.config.get("deteriorate"))))
+        yield Section(
+            "Beside the paper",
+            "The paper's photographs are not public. Its numbers and ours are from different images and different "
+            "prints, so they may be compared in shape, not digit by digit.",
+            tuple(tables),
+        )
+    if conditions:
+        charts = [
+            severity_chart(runs, name, metric)
+            for name in conditions
+            for metric in ("detection_score", "average_false_alarm")
+        ]
+        others = [condition_table(runs, name) for name in conditions if name not in PAPER]
+        yield Section(
+            "Severity",
+            "Each condition from rung to rung, all patches together.",
+            (breakpoint_table(runs), *charts, *others),
+        )
+    yield Section(
+        "Precision and recall",
+        "Which detections to keep: from the surest only to all.",
+        (precision_recall_chart(runs),),
+    )
+    sized = [g for g in runs[0].by if g.key.radius_px is not None]
+    if sized:
+        tables = [
+            group_table([g for g in run.by if g.key.radius_px is not None], f"By radius: {run.name}") for run in runs
+        ]
+        yield Section(
+            "Localisation by radius",
+            "Errors are of matches only, so they cannot exceed the reach of a match.",
+            (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"), *tables),
+        )
+    if any(run.confusion for run in runs):
+        yield Section(
+            "Identities",
+            "Matched detections: true ID in rows, detected ID in columns; other is an ID that no true keypoint has.",
+            tuple(confusion_table(run, patches) for run in runs if run.confusion),
+        )
+    if report.cases:
+        yield Section(
+            "Worst cases",
+            "The images with most failures, shared out among the conditions. Ellipses are true keypoints, crosses are "
+            "detections, numbers are IDs.",
+            tuple(Gallery(run.name, cases) for run, cases in zip(runs, report.cases, strict=True)),
+        )
+    listed = [(run, [g for g in run.by if g.key.radius_px is None]) for run in runs]
+    if any(groups for _, groups in listed):
+        yield Section(
+            "All groups",
+            "Everything by condition, rung and patch.",
+            tuple(group_table(groups, run.name, patches) for run, groups in listed if groups),
+        )
+
+
+def to_markdown_report(report: Report) -> str:
+    """Tables and text of a report; charts and pictures are left out."""
+    return _text(report, to_markdown, "# {}", "## {}", lambda text: text, "```json\n{}\n```")
+
+
+def to_latex_report(report: Report) -> str:
+    """Tables of a report, each a ``table`` environment, with the text between them as comments."""
+
+    def comment(text: str) -> str:
+        return "\n".join(f"% {line}" for line in text.splitlines())
+
+    return _text(report, to_latex, "% {}", "% {}", comment, None)
+
+
+def _text(
+    report: Report,
+    table: Callable[[Table], str],
+    head: str,
+    subhead: str,
+    text: Callable[[str], str],
+    provenance: str | None,
+) -> str:
+    parts = [head.format(report.title), text(_about(report))]
+    for section in sections(replace(report, cases=())):
+        parts += [subhead.format(section.title), text(section.lead)]
+        parts += [table(block) for block in section.blocks if isinstance(block, Table)]
+    known = json.dumps(report.provenance, indent=1)
+    parts.append(text(known) if provenance is None else provenance.format(known))
+    return "\n\n".join(part.strip("\n") for part in parts) + "\n"
+
+
+def _about(report: Report) -> str:
+    first = report.runs[0]
+    n = first.overall.counts
+    made = f" {report.images}" if report.images else ""
+    mark = f", fingerprint {first.fingerprint[:16]}" if first.fingerprint else ""
+    return f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{mark}."
+
+
+def to_html(report: Report) -> str:
+    """A page that needs nothing but itself: styles, script, charts and pictures are inside, and it may load nothing."""
+    import jinja2
+
+    folder = Path(__file__).parent / "templates"
+    environment = jinja2.Environment(
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+    )
+    template = environment.from_string((folder / "report.html").read_text("utf-8"))
+    style = (folder / "report.css").read_text("utf-8") + STYLE
+    return template.render(
+        report=report,
+        about=_about(report),
+        style=style,
+        script=(folder / "report.js").read_text("utf-8"),
+        sections=list(sections(report)),
+        provenance=json.dumps(report.provenance, indent=1),
+        text=cell_text,
+        sort_key=_sort_key,
+        share=_share,
+        base64=lambda data: base64.b64encode(data).decode(),
+    )
+
+
+def provenance(dataset: Dataset, predictions: Sequence[Path], command: Sequence[str] = ()) -> dict[str, Any]:
+    """What numbers were made from and with: files with their SHA-256, fingerprint, versions; no time, no machine."""
+    from importlib.metadata import version
+
+    from kpbench import __version__
+    from kpbench.store import sha256_of
+
+    return {
+        "kpbench": __version__,
+        "command": " ".join(command),
+        "predictions": [{"file": str(path), "sha256": sha256_of(path)} for path in predictions],
+        "dataset": {"path": str(dataset.path), "fingerprint": dataset.fingerprint},
+        "versions": {name: version(name) for name in ("numpy", "scipy")},
+    }
+
+
+def scores_file(scores: Scores, known: Mapping[str, Any]) -> bytes:
+    """The scores file (``kpbench.scores/1``): all numbers, the breakpoints, and the provenance."""
+    import orjson
+
+    content = scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)], "provenance": known}
+    return orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)
+
+
+def scores_csv(scores: Scores, known: Mapping[str, Any]) -> bytes:
+    """One row a group, the first overall; each row says which detector, dataset and version it is of."""
+    about = {"detector": scores.name, "dataset": scores.fingerprint, "kpbench": known["kpbench"]}
+    rows = [about | row for row in scores.rows()]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _sort_key(cell: Cell) -> str:
+    """What a browser sorts by: the bare number; nothing where there is none."""
+    value = cell.value if isinstance(cell, Estimate) else cell
+    return "" if value is None else str(value)
+
+
+def _share(row: Sequence[Cell], cell: Cell) -> int:
+    """Percent that a count has of its row."""
+    total = sum(c for c in row if isinstance(c, int))
+    return round(100 * cell / total) if isinstance(cell, int) and total else 0
+
+
+WRITERS: dict[str, Callable[[Report], str]] = {".html": to_html, ".md": to_markdown_report, ".tex": to_latex_report}
+
+
+def write_report(path: str | Path, report: Report) -> None:
+    """Write a report, whole or not at all; the suffix tells its form: .html, .md or .tex.
+
+    Raises
+    ------
+    DataError
+        If the suffix is another or the file cannot be written.
+    """
+    from kpbench.store import write_atomic
+
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        raise DataError(f"{path}: unknown kind of report, expected {', '.join(WRITERS)}")
+    write_atomic(path, WRITERS[path.suffix.lower()](report).encode())
