@@ -18,6 +18,7 @@ _HOMES = {
     "Patch": "design",
     "Predictions": "predictions",
     "Truth": "keypoints",
+    "compare": "comparison",
     "generate": "pipeline",
     "load_detector": "detect",
     "load_patches": "design",

@@ -1,4 +1,10 @@
-"""95 % intervals from a bootstrap over scenes: images of one scene are not independent, so scenes are drawn."""
+"""95 % intervals from a bootstrap over scenes: images of one scene are not independent, so scenes are drawn.
+
+With few scenes percentile intervals are too narrow: they lack the factor C/(C - 1) of a variance and the tails of
+Student's t. Both are put into the percentiles (Hesterberg 2015, "What teachers should know about the bootstrap",
+section on expanded percentiles).
+``benchmarks/coverage.py`` measures how often the intervals hold the truth.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr, stdtrit
 
 from kpbench.keypoints import Float
 
@@ -27,7 +34,7 @@ def by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
 def intervals(
     sums: NDArray[Any], statistics: Callable[[Float], Mapping[str, Float]], resamples: int, seed: int
 ) -> dict[str, Interval | None]:
-    """Percentile intervals of statistics of the summed rows, when rows are drawn with replacement.
+    """Expanded percentile intervals of statistics of the summed rows, when rows are drawn with replacement.
 
     Drawing C scenes with replacement is drawing how often each *kind* of scene (equal sums) comes up, a multinomial;
     so a million scenes cost as much as the few hundred different ones among them.
@@ -54,13 +61,19 @@ def intervals(
         shuffled = np.repeat(kinds, many, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
         many = np.ones(MOST_KINDS, np.int64)
+    tail = _tail(len(sums))
     drawn = rng.multinomial(many.sum(), many / many.sum(), size=resamples)
     result: dict[str, Interval | None] = {}
     for name, values in statistics(drawn.astype(float) @ kinds).items():
         values = values[np.isfinite(values)]
-        low, high = np.percentile(values, [2.5, 97.5]).tolist() if len(values) else (np.nan, np.nan)
+        low, high = np.quantile(values, [tail, 1 - tail]).tolist() if len(values) else (np.nan, np.nan)
         result[name] = (low, high) if len(values) else None
     return result
+
+
+def _tail(scenes: int) -> float:
+    """The share of resamples to leave out at each end for 95 %: 0.025 for many scenes, less for few."""
+    return float(ndtr(stdtrit(scenes - 1, 0.025) * np.sqrt(scenes / (scenes - 1))))
 
 
 def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 from kpbench.breakpoints import LIMIT, Breakpoint, breakpoints
 from kpbench.charts import Series, bar_chart, line_chart
+from kpbench.comparison import METRICS as COMPARED
+from kpbench.comparison import Comparison
 from kpbench.metrics import LABELS, PAPER_METRICS
 from kpbench.paper import PAPER, SYNTHETIC, PaperTable, paper_value
 from kpbench.scoring import Group, Scores
@@ -18,6 +20,7 @@ __all__ = [
     "condition_table",
     "confusion_table",
     "count_table",
+    "difference_table",
     "estimate",
     "group_table",
     "overview_table",
@@ -27,8 +30,10 @@ __all__ = [
     "severity_chart",
     "synthetic_table",
     "taxonomy_charts",
+    "verdict_table",
 ]
 
+DIFFERENCES = len(COMPARED)
 PAPER_STYLE = 7  # grey
 SHORT = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
 
@@ -189,6 +194,35 @@ def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
     names = [str(patches.get(i, i)) for i in run.confusion["ids"]]
     rows = tuple((name, *cells) for name, cells in zip(names, run.confusion["matrix"], strict=True))
     return Table(f"IDs of matched detections: {run.name}", ("true", *names, "other"), rows, shade=True)
+
+
+def verdict_table(comparisons: Sequence[Comparison]) -> Table:
+    """Wins and losses of the first detector: a row a rival and metric, counted over the conditions' rungs."""
+    rows: list[tuple[Cell, ...]] = []
+    for c in comparisons:
+        for d in c.differences[:DIFFERENCES]:
+            n = c.verdicts(d.metric)
+            whole = Estimate(d.value, d.interval)
+            wins = (n["better"], n["even"], n["worse"])
+            rows.append((c.second, LABELS[d.metric], d.first, d.second, whole, d.verdict, *wins))
+    name = comparisons[0].first
+    columns = ("against", "metric", name, "the other", "difference", "over all images", "rungs better", "even", "worse")
+    note = (
+        "A difference is called better or worse when its paired 95 % interval leaves out 0. Where nothing differs, "
+        "about 5 rungs in 100 are called so by chance."
+    )
+    return Table(f"{name} against the others", columns, tuple(rows), note)
+
+
+def difference_table(comparison: Comparison) -> Table:
+    """First minus second: a row a condition and rung, the first over all images."""
+    at: dict[tuple[str, str], list[Cell]] = {}
+    for d in comparison.differences:
+        key = ("all", "all") if d.condition is None else (d.condition, f"{d.rung:g}")
+        at.setdefault(key, []).append(Estimate(d.value, d.interval))
+    names = [LABELS[d.metric] for d in comparison.differences[:DIFFERENCES]]
+    title = f"{comparison.first} minus {comparison.second}"
+    return Table(title, ("condition", "rung", *names), tuple((*key, *cells) for key, cells in at.items()))
 
 
 # --- charts -----------------------------------------------------------------------------------------------------

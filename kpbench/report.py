@@ -14,8 +14,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import orjson
+
 from kpbench.breakpoints import breakpoints
 from kpbench.charts import STYLE
+from kpbench.comparison import Comparison
 from kpbench.errors import DataError
 from kpbench.exhibits import (
     Figure,
@@ -23,6 +26,7 @@ from kpbench.exhibits import (
     condition_table,
     confusion_table,
     count_table,
+    difference_table,
     group_table,
     overview_table,
     paper_table,
@@ -31,6 +35,7 @@ from kpbench.exhibits import (
     severity_chart,
     synthetic_table,
     taxonomy_charts,
+    verdict_table,
 )
 from kpbench.paper import PAPER
 from kpbench.scoring import Scores
@@ -43,6 +48,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Report",
     "Section",
+    "comparison_file",
     "provenance",
     "scores_csv",
     "scores_file",
@@ -52,6 +58,9 @@ __all__ = [
     "to_markdown_report",
     "write_report",
 ]
+
+
+COMPARISON_SCHEMA = "kpbench.comparison/1"
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,8 @@ class Report:
         For each run the images to show; may be empty.
     provenance : mapping
         Versions, command, fingerprints.
+    comparisons : tuple of Comparison
+        Of the first run with others; may be empty.
     title : str
     """
 
@@ -75,6 +86,7 @@ class Report:
     config: Mapping[str, Any] = field(default_factory=dict)
     cases: tuple[tuple[Case, ...], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    comparisons: tuple[Comparison, ...] = ()
     title: str = "kpbench report"
 
     @property
@@ -115,6 +127,12 @@ def sections(report: Report) -> Iterator[Section]:
         f"({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
         (overview_table(runs), count_table(runs), *taxonomy_charts(runs)),
     )
+    if report.comparisons:
+        yield Section(
+            "Compared",
+            "Differences are paired: the same scenes are resampled for both.",
+            (verdict_table(report.comparisons), *map(difference_table, report.comparisons)),
+        )
     conditions = list(dict.fromkeys(name for run in runs for name in run.conditions))
     known = [PAPER[name] for name in conditions if name in PAPER]
     if known or report.config.get("kind") == "synth":
@@ -257,10 +275,17 @@ def provenance(dataset: Dataset, predictions: Sequence[Path], command: Sequence[
 
 def scores_file(scores: Scores, known: Mapping[str, Any]) -> bytes:
     """The scores file (``kpbench.scores/1``): all numbers, the breakpoints, and the provenance."""
-    import orjson
+    return _json(scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)], "provenance": known})
 
-    content = scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)], "provenance": known}
+
+def _json(content: Mapping[str, Any]) -> bytes:
     return orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)
+
+
+def comparison_file(comparisons: Sequence[Comparison], known: Mapping[str, Any]) -> bytes:
+    """The comparison file (``kpbench.comparison/1``): every difference, and the provenance."""
+    content = {"schema": COMPARISON_SCHEMA, "comparisons": [c.to_dict() for c in comparisons], "provenance": known}
+    return _json(content)
 
 
 def scores_csv(scores: Scores, known: Mapping[str, Any]) -> bytes:

@@ -112,6 +112,8 @@ class Scores:
         score are kept, from the surest on; at most 201 points.
     tally : Tally
         The rows behind the numbers, of every true keypoint and detection.
+    name : str
+        What tables and charts call the detector: its name and version.
     """
 
     overall: Group
@@ -119,6 +121,7 @@ class Scores:
     confusion: dict[str, Any]
     curve: dict[str, list[float | None]]
     tally: Tally = field(repr=False)
+    name: str = "detector"
 
     def __getitem__(self, name: str) -> float | None:
         """A metric over all images."""
@@ -133,11 +136,6 @@ class Scores:
     def detector(self) -> dict[str, Any]:
         """What the predictions file says about the detector."""
         return self.tally.detector
-
-    @property
-    def name(self) -> str:
-        """The detector's name and version, or "detector"."""
-        return " ".join(str(self.detector[k]) for k in ("name", "version") if self.detector.get(k)) or "detector"
 
     @property
     def fingerprint(self) -> str:
@@ -393,7 +391,8 @@ def evaluate(
 def summarise(rows: Tally) -> Scores:
     """All metrics of a tally."""
     overall, *by = _groups(rows)
-    return Scores(overall, tuple(by), _confusion(rows), _curve(rows), rows)
+    name = " ".join(str(rows.detector[key]) for key in ("name", "version") if rows.detector.get(key))
+    return Scores(overall, tuple(by), _confusion(rows), _curve(rows), rows, name or "detector")
 
 
 def check_gates(scores: Scores, least: dict[str, float], most: dict[str, float]) -> None:

@@ -29,14 +29,25 @@ LAYERS = [
     {"metrics", "bootstrap"},
     {"tally"},
     {"scoring"},
-    {"breakpoints", "charts", "gallery", "paper", "preview", "tables"},
+    {"breakpoints", "charts", "comparison", "gallery", "paper", "preview", "tables"},
     {"exhibits", "interchange"},
     {"report"},
     {"pipeline"},
 ]
 EVALUATOR = {
     *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "detect", "store", "sources"),
-    *("breakpoints", "charts", "exhibits", "gallery", "interchange", "paper", "preview", "report", "tables"),
+    *(
+        "breakpoints",
+        "charts",
+        "comparison",
+        "exhibits",
+        "gallery",
+        "interchange",
+        "paper",
+        "preview",
+        "report",
+        "tables",
+    ),
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),

@@ -69,7 +69,7 @@ def report(scores):
     config = {"kind": "suite", "patches": [{"id": 0, "name": "checker"}, {"id": 1, "name": "<trefoil>"}]}
     other = score(*ladder(share={3: 1.0, 15: 0.5}, condition="fog & <rain>"), resamples=50)
     assert other.conditions == {"fog & <rain>": [3, 15]}
-    return Report((scores,), config, (worst_cases(scores.tally, image),), {"command": "kpbench <score>"}, "A & B")
+    return Report((scores,), config, (worst_cases(scores.tally, image),), {"command": "kpbench <score>"}, title="A & B")
 
 
 # --- tables -----------------------------------------------------------------------------------------------------

@@ -1,8 +1,9 @@
-"""The command that scores a predictions file."""
+"""The commands that score predictions files and compare them."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,11 +12,12 @@ import click
 from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
+    from kpbench.comparison import Comparison
     from kpbench.predictions import Predictions
     from kpbench.scoring import Scores
     from kpbench.store import Dataset
 
-__all__ = ["score"]
+__all__ = ["compare", "score"]
 
 
 class Limit(click.ParamType[tuple[str, float]]):
@@ -43,34 +45,43 @@ class Limit(click.ParamType[tuple[str, float]]):
 FILE = click.Path(dir_okay=False, path_type=Path)
 
 
+def how_to_score(command: Callable[..., None]) -> Callable[..., None]:
+    """The options that say what a match is, and against which truth."""
+    options = (
+        click.option(
+            "--gt", type=click.Path(path_type=Path), help="Dataset; else the one named in PREDS, else ./kpbench-data."
+        ),
+        click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii."),
+        click.option("--eps-radius", type=click.Choice(["major", "minor", "mean"]), default="major", show_default=True),
+        click.option(
+            "--matching", type=click.Choice(["one-to-one", "literal"]), default="one-to-one", show_default=True
+        ),
+        click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections."),
+        click.option(
+            "--report", "report_file", type=FILE, help="Write tables and charts: .html (one offline page), .md, .tex."
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
 @click.command()
 @click.argument("preds", type=FILE)
-@click.option(
-    "--gt", type=click.Path(path_type=Path), help="Dataset; else the one named in PREDS, else ./kpbench-data."
-)
-@click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii.")
-@click.option("--eps-radius", type=click.Choice(["major", "minor", "mean"]), default="major", show_default=True)
-@click.option("--matching", type=click.Choice(["one-to-one", "literal"]), default="one-to-one", show_default=True)
-@click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections.")
+@how_to_score
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row a condition, rung and patch.")
-@click.option(
-    "--report", "report_file", type=FILE, help="Write tables and charts: .html (one offline page), .md, .tex."
-)
 @click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
 @click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")
 def score(
     preds: Path,
     gt: Path | None,
-    eps: float,
-    eps_radius: Any,
-    matching: Any,
-    allow_missing: bool,
+    report_file: Path | None,
     json_file: Path | None,
     csv_file: Path | None,
-    report_file: Path | None,
     least: tuple[tuple[str, float], ...],
     most: tuple[tuple[str, float], ...],
+    **how: Any,
 ) -> None:
     """Score a predictions file (.json, .jsonl, .csv, .parquet, .h5) against a dataset's true keypoints.
 
@@ -80,43 +91,117 @@ def score(
       kpbench score preds.json --report report.html
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
-    from kpbench.errors import PredictionsError
-    from kpbench.predictions import read_predictions
-    from kpbench.report import WRITERS, provenance, scores_csv, scores_file
+    from kpbench.report import provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
-    from kpbench.scoring import score as score_all
     from kpbench.store import write_atomic
 
-    if report_file and report_file.suffix.lower() not in WRITERS:
-        raise click.UsageError(f"--report {report_file}: expected a file ending in {', '.join(WRITERS)}")
-    predictions = read_predictions(preds)
-    dataset = _dataset_of(predictions, preds, gt)
-    try:
-        scores = score_all(
-            dataset, predictions, eps=eps, eps_radius=eps_radius, matching=matching, allow_missing=allow_missing
-        )
-    except PredictionsError as error:
-        raise PredictionsError(f"{preds} does not fit {dataset.path}: {error}") from None
+    _check_report(report_file)
+    dataset, (scores,) = _scored([preds], gt, how)
     known = provenance(dataset, [preds], ["kpbench", *sys.argv[1:]])
     if json_file:
         write_atomic(json_file, scores_file(scores, known))
     if csv_file:
         write_atomic(csv_file, scores_csv(scores, known))
     if report_file:
-        _write_report(report_file, scores, dataset, known)
+        _write_report(report_file, [scores], dataset, known)
     click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
     click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
     click.echo(_summary(scores))
     check_gates(scores, dict(least), dict(most))
 
 
-def _write_report(path: Path, scores: Scores, dataset: Dataset, known: dict[str, Any]) -> None:
+@click.command()
+@click.argument("files", nargs=-1, required=True, type=FILE)
+@how_to_score
+@click.option("--json", "json_file", type=FILE, help="Write all differences.")
+@click.option("--fail-on-regression", is_flag=True, help="Exit 1 if the first is worse over all images.")
+def compare(
+    files: tuple[Path, ...],
+    gt: Path | None,
+    report_file: Path | None,
+    json_file: Path | None,
+    fail_on_regression: bool,
+    **how: Any,
+) -> None:
+    """Compare the first of several predictions files with each of the others, on the same dataset.
+
+    Differences are paired: their 95 % intervals resample the scenes for both alike. With --fail-on-regression the exit
+    code is 1 if detection score, ID matching score or false alarms of the first are worse over all images and the
+    interval of the difference leaves out 0.
+
+    \b
+    Examples:
+      kpbench compare new.json old.json --fail-on-regression
+      kpbench compare a.json b.json c.json --report compared.html
+    """
+    from kpbench.comparison import check_regression
+    from kpbench.comparison import compare as compare_scores
+    from kpbench.exhibits import difference_table, verdict_table
+    from kpbench.report import comparison_file, provenance
+    from kpbench.store import write_atomic
+    from kpbench.tables import to_plain
+
+    if len(files) < 2:
+        raise click.UsageError("expected two or more predictions files")
+    _check_report(report_file)
+    dataset, (first, *others) = _scored(files, gt, how)
+    comparisons = [compare_scores(first, other) for other in others]
+    known = provenance(dataset, files, ["kpbench", *sys.argv[1:]])
+    if json_file:
+        write_atomic(json_file, comparison_file(comparisons, known))
+    if report_file:
+        _write_report(report_file, [first, *others], dataset, known, comparisons)
+    click.echo(f"dataset {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
+    for table in (verdict_table(comparisons), *map(difference_table, comparisons)):
+        click.echo(f"\n{table.title}\n{to_plain(table)}")
+    if fail_on_regression:
+        check_regression(comparisons)
+
+
+def _check_report(path: Path | None) -> None:
+    from kpbench.report import WRITERS
+
+    if path and path.suffix.lower() not in WRITERS:
+        raise click.UsageError(f"--report {path}: expected a file ending in {', '.join(WRITERS)}")
+
+
+def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tuple[Dataset, list[Scores]]:
+    """The dataset of the first file, and the scores of all; detectors of one name are told apart by their files."""
+    from dataclasses import replace
+
+    from kpbench.errors import PredictionsError
+    from kpbench.predictions import read_predictions
+    from kpbench.scoring import score as score_all
+
+    predictions = [read_predictions(path) for path in files]
+    dataset = _dataset_of(predictions[0], files[0], gt)
+    scores: list[Scores] = []
+    for path, found in zip(files, predictions, strict=True):
+        try:
+            scores.append(score_all(dataset, found, **how))
+        except PredictionsError as error:
+            raise PredictionsError(f"{path} does not fit {dataset.path}: {error}") from None
+    names = [run.name for run in scores]
+    for n, run in enumerate(scores):
+        if names.count(run.name) > 1:
+            scores[n] = replace(run, name=f"{run.name} {files[n]}")
+    return dataset, scores
+
+
+def _write_report(
+    path: Path,
+    runs: Sequence[Scores],
+    dataset: Dataset,
+    known: dict[str, Any],
+    comparisons: Sequence[Comparison] = (),
+) -> None:
     from kpbench.gallery import worst_cases
     from kpbench.report import Report, write_report
 
     pictures = path.suffix.lower() == ".html"
-    cases = (worst_cases(scores.tally, dataset.image),) if pictures else ()
-    write_report(path, Report((scores,), dataset.config, cases, known, f"{scores.name} on {dataset.path.name}"))
+    cases = tuple(worst_cases(run.tally, dataset.image, 12 // len(runs) or 1) for run in runs) if pictures else ()
+    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
+    write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), title))
 
 
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset:
