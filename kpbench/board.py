@@ -11,21 +11,59 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from kpbench.design import Patch, load_patches, shipped_patches
+from kpbench.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
+from kpbench.geometry import project
 from kpbench.keypoints import Float
 from kpbench.outline import cos_sin_deg
 
-__all__ = ["Board", "BoardKeypoint", "find_patch", "grid_board", "hexagon_board", "load_board"]
+__all__ = ["Board", "BoardKeypoint", "CameraBoard", "find_patch", "grid_board", "hexagon_board", "load_board"]
 
 TOML_SCHEMA = "kpbench.board-design/1"
 HEXAGON_DIAMETER = 0.16  # of the board's side, from the paper's 16-px patch on a board of 0.5 % of the image
 HEXAGON_CIRCUMRADIUS = 0.36
 GRID_PITCH = 2.0  # disc diameters
+
+
+class CameraKeypoint(Protocol):
+    """A point on a board and the disc that is its measure, which a patch fills."""
+
+    @property
+    def patch_id(self) -> int:
+        """The identity that detectors report."""
+        ...
+
+    @property
+    def H_patch2board(self) -> Float:
+        """Unit disc to mm of the board frame, ndarray of shape (3, 3)."""
+        ...
+
+
+class CameraBoard(Protocol):
+    """What :mod:`kpbench.camera` needs of a board: a :class:`Board`, or a :class:`kpbench.tags.TagBoard`."""
+
+    @property
+    def side_x_mm(self) -> float:
+        """Width."""
+        ...
+
+    @property
+    def side_y_mm(self) -> float:
+        """Height."""
+        ...
+
+    @property
+    def keypoints(self) -> Sequence[CameraKeypoint]:
+        """In the order of their truth."""
+        ...
+
+    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+        """See :meth:`Board.outlines`."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,6 +75,11 @@ class BoardKeypoint:
     y_mm: float
     rotate_deg: float
     diameter_mm: float
+
+    @property
+    def patch_id(self) -> int:
+        """The identity that detectors report."""
+        return self.patch.patch_id
 
     @property
     def extent_mm(self) -> float:
@@ -100,6 +143,20 @@ class Board:
     def points_mm(self) -> Float:
         """Keypoints in the board frame, ndarray of shape (N, 3) with z = 0."""
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
+
+    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+        """Outlines as polygons of shape (N, 2) in mm: those of each part of the black ink, and of each keypoint's disc.
+
+        Parts do not overlap. Curves are true to a thousandth of a pixel where the radius of keypoint n is
+        ``radius_px[n]``.
+        """
+        parts, discs = [], []
+        for k, radius in zip(self.keypoints, radius_px, strict=True):
+            # the tolerance is rounded to a power of two so that polygons are reused
+            black, disc = unit_polygons(k.patch, 2.0 ** np.floor(np.log2(1e-3 / radius)))
+            parts.append([project(k.H_patch2board, polygon) for polygon in black])
+            discs.append([project(k.H_patch2board, polygon) for polygon in disc])
+        return parts, discs
 
     @property
     def digest(self) -> str:

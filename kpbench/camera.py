@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from kpbench.board import Board
-from kpbench.design import unit_polygons
+from kpbench.board import CameraBoard
 from kpbench.errors import DataError
-from kpbench.geometry import NO_DISTORTION, Camera, Ellipse, plane_to_camera, project, projected_disc, rotation_xyz
+from kpbench.geometry import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
 from kpbench.outline import flatten, rectangle
 from kpbench.raster import Box, box_around, coverage
@@ -82,7 +81,7 @@ def to_px(camera: Camera, pose: Pose, points_mm: Float) -> Float:
     return camera.project(np.column_stack([points_mm, np.ones(len(points_mm))]) @ pose.M_board2camera.T)
 
 
-def outline_px(camera: Camera, pose: Pose, board: Board, inset: float = 0.0) -> Float:
+def outline_px(camera: Camera, pose: Pose, board: CameraBoard, inset: float = 0.0) -> Float:
     """The board's edge in the image, shape (N, 2); ``inset`` in mm moves it inwards."""
     w, h = board.side_x_mm - 2 * inset, board.side_y_mm - 2 * inset
     corners = flatten(rectangle(-w / 2, -h / 2, w, h), 1.0)[0]
@@ -103,7 +102,7 @@ def _bent(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
 
 def pose_board(
     camera: Camera,
-    board: Board,
+    board: CameraBoard,
     area_percent: float,
     *,
     pitch_deg: float = 0.0,
@@ -146,7 +145,7 @@ def pose_board(
     )
 
 
-def _depth(camera: Camera, board: Board, R: Float, ray: Float, area_px: float) -> float:
+def _depth(camera: Camera, board: CameraBoard, R: Float, ray: Float, area_px: float) -> float:
     """Distance along the optical axis, mm, at which the board's image has an area."""
 
     def solve(lens: Camera, near: float, far: float) -> float:
@@ -167,7 +166,7 @@ def _depth(camera: Camera, board: Board, R: Float, ray: Float, area_px: float) -
         raise DataError(f"no distance gives a board an image of {area_px:.0f} px at this tilt and lens") from None
 
 
-def board_keypoints(camera: Camera, pose: Pose, board: Board) -> NDArray[Any]:
+def board_keypoints(camera: Camera, pose: Pose, board: CameraBoard) -> NDArray[Any]:
     """Truth of every keypoint of a board that lies wholly in the image, a :data:`KEYPOINT_DTYPE` table.
 
     With a distorting lens ``H_patch2image`` is the homography that agrees with the lens at the keypoint to
@@ -182,7 +181,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: Board) -> NDArray[Any]:
         H /= H[2, 2]
         x, y = camera.distort(ray[None])[0]
         e = _moments_ellipse(_rim(camera, M)) if any(camera.distortion) else projected_disc(H)
-        keypoints[n] = (x, y, k.patch.patch_id, e.major, e.minor, e.angle_deg, H, 1.0, np.nan)
+        keypoints[n] = (x, y, k.patch_id, e.major, e.minor, e.angle_deg, H, 1.0, np.nan)
     return keypoints
 
 
@@ -208,7 +207,7 @@ def _moments_ellipse(points: Float) -> Ellipse:
     return Ellipse(float(x), float(y), float(major), float(minor), angle_deg)
 
 
-def render_board(background: UInt8, camera: Camera, pose: Pose, board: Board, look: Look) -> Rendered:
+def render_board(background: UInt8, camera: Camera, pose: Pose, board: CameraBoard, look: Look) -> Rendered:
     """Paint a board before a background with exact area coverage.
 
     Parameters
@@ -224,29 +223,29 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: Board, lo
     keypoints = board_keypoints(camera, pose, board)
     inset = EDGE * min(board.side_x_mm, board.side_y_mm)
     edge, face = outline_px(camera, pose, board), outline_px(camera, pose, board, inset)
-    regions, boxes = [[edge], [face]], [(0, 0, 0, 0)] * 2
-    for k, radius in zip(board.keypoints, keypoints["radius_major"], strict=True):
-        # edges true to 1/1000 px; the tolerance is rounded to a power of two so that polygons are reused
-        black, disc = unit_polygons(k.patch, 2.0 ** np.floor(np.log2(1e-3 / radius)))
-        H = k.H_patch2board
-        projected = [[_bent(camera, pose, project(H, p)) for p in part] for part in (black, disc)]
-        regions += projected
-        boxes += [box_around(projected[1])] * 2
-    boxes[:2] = [box_around([p for region in regions for p in region])] * 2
-    covers = coverage(regions, boxes)
-    masks = tuple(Mask(boxes[n], covers[n], covers[n + 1]) for n in range(2, len(boxes), 2))
+    parts, discs = (
+        [[_bent(camera, pose, polygon) for polygon in region] for region in regions]
+        for regions in board.outlines(keypoints["radius_major"])
+    )
+    part_boxes, disc_boxes = [box_around(part) for part in parts], [box_around(disc) for disc in discs]
+    whole = box_around([polygon for region in ([edge], *parts, *discs) for polygon in region])
+    covers = coverage([[edge], [face], *parts, *discs], [whole, whole, *part_boxes, *disc_boxes])
+    board_cover, face_cover = covers[:2]
+    black = np.zeros_like(face_cover)
+    for box, cover in zip(part_boxes, covers[2:], strict=False):
+        black[_within(whole, box)] += cover
+    masks = tuple(
+        Mask(box, black[_within(whole, box)], cover * face_cover[_within(whole, box)])
+        for box, cover in zip(disc_boxes, covers[2 + len(parts) :], strict=True)
+    )
 
     image, side_px = background.copy(), float(np.sqrt(polygon_area(edge)))
     if look.shadow:
         _cast_shadow(image, edge, side_px, look)
-    there, here = inside_image(boxes[0], image)
-    below, face_cover = 1.0 - covers[0], covers[1]
-    ink = look.white * (look.edge * (covers[0] - face_cover) + face_cover)
-    x0, y0 = boxes[0][:2]
-    for mask in masks:
-        x, y, w, h = mask.box
-        ink[y - y0 : y - y0 + h, x - x0 : x - x0 + w] -= (look.white - look.black) * mask.black
-    ink *= _light(look, boxes[0], to_px(camera, pose, np.zeros((1, 2)))[0], side_px)
+    there, here = inside_image(whole, image)
+    below = 1.0 - board_cover
+    ink = look.white * (look.edge * (board_cover - face_cover) + face_cover) - (look.white - look.black) * black
+    ink *= _light(look, whole, to_px(camera, pose, np.zeros((1, 2)))[0], side_px)
     ink, below = ink[here], below[here]
     if background.ndim == 3:
         ink, below = ink[..., None], below[..., None]
@@ -255,6 +254,12 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: Board, lo
         keypoints[n]["visible"] = mask.disc[inside_image(mask.box, image)[1]].sum() / mask.disc.sum()
     keypoints["contrast"] = measure_contrast(image, masks)
     return Rendered(image, keypoints, masks)
+
+
+def _within(whole: Box, part: Box) -> tuple[slice, slice]:
+    """Rows and columns of a box in a larger one."""
+    x, y = part[0] - whole[0], part[1] - whole[1]
+    return slice(y, y + part[3]), slice(x, x + part[2])
 
 
 def _light(look: Look, box: Box, centre_px: Float, side_px: float) -> Float:

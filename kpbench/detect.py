@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -20,14 +21,23 @@ from numpy.typing import NDArray
 from kpbench import __version__
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
+from kpbench.program import run_program
 
 __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
 
 DETECTORS = {
     "template": "kpbench.detectors.template:TemplateDetector",
     "superpoint-small": "kpbench.detectors.superpoint:SmallSuperPointDetector",
+    "orb": "kpbench.detectors.features:orb",
+    "sift": "kpbench.detectors.features:sift",
+    "aruco": "kpbench.detectors.tags:ArucoDetector",
+    "apriltag": "kpbench.detectors.tags:AprilTagDetector",
+    "charuco": "kpbench.detectors.tags:CharucoDetector",
 }
 """Name → where the shipped detector is, as ``MODULE:ATTR``."""
+
+PROGRAM = "program:"
+"""What the name of a detector begins with that is a program, see :func:`kpbench.program.run_program`."""
 
 
 class Detector(Protocol):
@@ -42,6 +52,13 @@ class Detector(Protocol):
 class LoadedDetector:
     """A detector with a name and a version; call it with an image.
 
+    Attributes
+    ----------
+    name, version : str
+    run : function of an image.
+    board : the board of tags that it looks for (:data:`kpbench.tags.TAG_BOARDS`), None for patches.
+    run_many : function of several images, where that is faster than one by one, or None.
+
     Raises
     ------
     DataError
@@ -51,21 +68,31 @@ class LoadedDetector:
     name: str
     version: str
     run: Callable[[UInt8], Detections]
+    board: str | None = None
+    run_many: Callable[[Sequence[UInt8]], list[Detections]] | None = None
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections in one image, (H, W) grey or (H, W, 3) RGB, uint8."""
-        found = self.run(image)
+        return self._checked(self.run(image))
+
+    detect = __call__
+
+    def detect_many(self, images: Sequence[UInt8]) -> list[Detections]:
+        """The same for each of several images; if it raises, nobody knows on which."""
+        if self.run_many is None:
+            return [self(image) for image in images]
+        return [self._checked(found) for found in self.run_many(images)]
+
+    def _checked(self, found: object) -> Detections:
         if not isinstance(found, Detections):
             raise DataError(f"detector {self.name}: returned {type(found).__name__}, expected kpbench.Detections")
         if not (np.isfinite(found.xy).all() and np.isfinite(found.score).all()):
             raise DataError(f"detector {self.name}: returned a coordinate or score that is not finite")
         return found
 
-    detect = __call__
-
 
 def load_detector(name: str) -> LoadedDetector:
-    """A shipped detector by name, or one of yours by ``MODULE:ATTR``.
+    """A shipped detector by name, one of yours by ``MODULE:ATTR``, or a program by ``program:COMMAND``.
 
     ``ATTR`` may be a function of an image, an object with a method ``detect`` (or that can be called), or a
     class that gives such an object when called without arguments. Modules in the current folder are found.
@@ -75,20 +102,27 @@ def load_detector(name: str) -> LoadedDetector:
     DataError
         If there is no such detector, or it is none.
     """
+    if name.startswith(PROGRAM):
+        many = partial(run_program, name.removeprefix(PROGRAM).strip())
+        return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
-            f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or MODULE:ATTR of your own"
+            f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or MODULE:ATTR or program:COMMAND "
+            "of your own"
         )
     found = _resolve(DETECTORS.get(name, name))
     try:
         made = found() if isinstance(found, type) else found
+    except DataError:
+        raise
     except Exception as error:
         raise DataError(f"detector {name!r}: cannot be made, {type(error).__name__}: {one_line(error)}") from None
     run = getattr(made, "detect", made)
     if not callable(run):
         raise DataError(f"detector {name!r}: {made!r} cannot be called and has no method detect(image)")
     version = getattr(made, "version", __version__ if name in DETECTORS else "unknown")
-    return LoadedDetector(str(getattr(made, "name", name)), str(version), run)
+    label = name if name in DETECTORS else str(getattr(made, "name", name))
+    return LoadedDetector(label, str(version), run, getattr(made, "board", None))
 
 
 def _resolve(path: str) -> Any:

@@ -31,7 +31,7 @@ from kpbench.scene import stream
 from kpbench.sources import Source, image_writer
 from kpbench.workers import Progress, run_pieces
 
-__all__ = ["Predicted", "Recipe", "degrade_files", "generate", "predict", "predict_images"]
+__all__ = ["Predicted", "Recipe", "degrade_files", "detect_some", "generate", "predict", "predict_images"]
 
 
 class Recipe(Protocol):
@@ -282,7 +282,7 @@ def predict(
     if not isinstance(detector, str):
         workers = 1
     pieces = [range(first, min(first + 32, len(dataset))) for first in range(0, len(dataset), 32)]
-    work = partial(_detect_some, dataset, loaded if workers == 1 else detector, threshold)
+    work = partial(detect_some, dataset, loaded if workers == 1 else detector, threshold)
     found: dict[int, Found] = {}
     for results in run_pieces(work, pieces, workers, progress):
         found.update(results)
@@ -344,7 +344,11 @@ def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> 
         found = detector(image)
     except Exception as error:  # whatever a detector of somebody else raises
         return Detections.none(), f"{type(error).__name__}: {one_line(error)}{_line_of(error)}"
-    return (found if threshold is None else found[found.score >= threshold]), ""
+    return _sure(found, threshold), ""
+
+
+def _sure(found: Detections, threshold: float | None) -> Detections:
+    return found if threshold is None else found[found.score >= threshold]
 
 
 def _line_of(error: BaseException) -> str:
@@ -360,10 +364,19 @@ def _loaded(name: str) -> LoadedDetector:
     return load_detector(name)
 
 
-def _detect_some(
+def detect_some(
     dataset: store.Dataset, detector: str | LoadedDetector, threshold: float | None, piece: range, progress: Progress
 ) -> dict[int, Found]:
+    """What a detector finds in some images of a dataset, and the message of each on which it raised, else "".
+
+    Parameters are those of :func:`predict`; ``piece`` holds the positions of the images.
+    """
     loaded = _loaded(detector) if isinstance(detector, str) else detector
+    if loaded.run_many is not None:
+        with contextlib.suppress(Exception):  # if it fails, one by one tells on which images
+            together = loaded.detect_many([dataset.image(n) for n in piece])
+            progress(len(piece))
+            return {n: (_sure(found, threshold), "") for n, found in zip(piece, together, strict=True)}
     results: dict[int, Found] = {}
     for n in piece:
         results[n] = _detect(loaded, dataset.image(n), threshold)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 
 from kpbench import degrade, store
 from kpbench.background import Background, PhotoFolder, procedural
-from kpbench.board import Board, find_patch, hexagon_board, keys, number
+from kpbench.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.geometry import Camera
 from kpbench.scene import measure_contrast, stream
+from kpbench.tags import TAG_BOARDS, tag_board
 
 __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "load_suite", "shipped_suites"]
 
@@ -93,7 +94,7 @@ class Shot:
     condition: str
     rung: float
     scene: int
-    board: Board
+    board: CameraBoard
     pose: Pose
     look: Look
     effects: list[dict[str, Any]]
@@ -113,6 +114,7 @@ class SuiteConfig:
     only : names of conditions; empty for all.
     backgrounds : folder of photographs, or None for procedural ones.
     distortion : OpenCV's k1, k2, p1, p2, k3; what is left out is 0.
+    board : one of :data:`kpbench.tags.TAG_BOARDS` in the place of the suite's boards of patches, or None.
     shard_size : images a shard; changes the files but no image.
 
     Raises
@@ -128,6 +130,7 @@ class SuiteConfig:
     only: tuple[str, ...] = ()
     backgrounds: Path | None = None
     distortion: tuple[float, ...] = ()
+    board: str | None = None
     shard_size: int = 100  # 200 MB of pixels at 1624x1240
 
     def __post_init__(self) -> None:
@@ -141,6 +144,7 @@ class SuiteConfig:
         need(min(width, height) >= 64, f"--size is {width}x{height}, expected at least 64x64")
         need(max(width, height) <= 16384, f"--size is {width}x{height}, at most 16384 a side")
         need(self.shard_size >= 1, f"the shard size is {self.shard_size}, expected a number of images from 1")
+        need(self.board in (None, *TAG_BOARDS), f"--board is {self.board}, expected one of: {', '.join(TAG_BOARDS)}")
         known = [c.name for c in self.suite.conditions]
         for name in self.only:
             need(name in known, f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
@@ -161,10 +165,22 @@ class SuiteConfig:
         chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
+    @cached_property
+    def boards(self) -> tuple[CameraBoard, ...]:
+        """The boards that are seen in every scene under every rung."""
+        if self.board is not None:
+            return (tag_board(self.board, BOARD_SIDE_MM),)
+        return tuple(hexagon_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
+
+    @property
+    def name(self) -> str:
+        """Of the suite, and of the board if it is not the suite's own."""
+        return self.suite.name if self.board is None else f"{self.suite.name}-{self.board}"
+
     @property
     def n(self) -> int:
-        """Number of images: rungs x patches x scenes."""
-        return len(self.rungs) * len(self.suite.patches) * self.scenes
+        """Number of images: rungs x boards x scenes."""
+        return len(self.rungs) * len(self.boards) * self.scenes
 
     @property
     def image_bytes(self) -> int:
@@ -190,6 +206,9 @@ class SuiteConfig:
         if photos is not None:
             source = {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
         conditions = {c.name: c for c, _ in self.rungs}.values()
+        shown: dict[str, Any] = {"patches": [patch.to_dict() for patch in self.suite.patches]}
+        if self.board is not None:
+            shown = {"board": tag_board(self.board, BOARD_SIDE_MM).to_dict()}
         return {
             "kind": "suite",
             "suite": self.suite.name,
@@ -203,22 +222,22 @@ class SuiteConfig:
             "backgrounds": source,
             "scene": {key: list(span) for key, span in self.suite.scene},
             "conditions": [_listed(c) for c in conditions],
-            "patches": [patch.to_dict() for patch in self.suite.patches],
+            **shown,
         }
 
     def shot(self, index: int) -> Shot:
         """Pose, light, effects and truth of one image; nothing is painted.
 
-        Images are ordered by condition, rung, patch and scene.
+        Images are ordered by condition, rung, board and scene.
         """
         rest, scene = divmod(index, self.scenes)
-        rung, patch = divmod(rest, len(self.suite.patches))
+        rung, which = divmod(rest, len(self.boards))
         condition, step = self.rungs[rung]
         rng = stream(self.seed, scene, SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
         tilt = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
-        board = _board(self.suite.patches[patch])
+        board = self.boards[which]
         shift = (drawn["shift_x"], drawn["shift_y"])
         pose = pose_board(self.camera, board, drawn["area_percent"], shift=shift, **tilt)
         slope = (drawn["slope_x"], drawn["slope_y"])
@@ -259,11 +278,6 @@ class SuiteConfig:
         if len(self._kept) < KEPT_BYTES // background.image.nbytes:
             self._kept[scene] = background
         return background
-
-
-@lru_cache(maxsize=64)
-def _board(patch: Patch) -> Board:
-    return hexagon_board(patch, BOARD_SIDE_MM)
 
 
 def _listed(condition: Condition) -> dict[str, Any]:

@@ -155,7 +155,9 @@ def test_the_command_tells_who_is_better_and_exits(here):
     assert [p["file"] for p in content["provenance"]["predictions"]] == ["good.json", "poor.csv"]
     assert "d good.json against the others" in (here / "c.html").read_text()
     worse = kpbench("poor.csv", "good.json", "--fail-on-regression", code=1)
-    assert worse.stderr.startswith("kpbench: detection score of d poor.csv is worse than that of d good.json by -0.3333 [")
+    assert worse.stderr.startswith(
+        "kpbench: detection score of d poor.csv is worse than that of d good.json by -0.3333 ["
+    )
     assert "Traceback" not in worse.output
     assert kpbench("poor.csv", "good.json").stderr == ""
 

@@ -32,6 +32,7 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
     blocks = [(kind, code) for kind, code in FENCE.findall(page.read_text()) if kind in ("sh", "python", "toml")]
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     if any("photos" in code for _, code in blocks):
         (tmp_path / "photos").mkdir()
         for n in range(11):
@@ -54,8 +55,7 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
 def run_shell(code):
     lines = [shlex.split(line, comments=True) for line in code.replace("\\\n", " ").splitlines()]
     if any(words and words[0] != "kpbench" for words in lines):
-        path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-        subprocess.run(["bash", "-ec", code], check=True, capture_output=True, env={**os.environ, "PATH": path})
+        subprocess.run(["bash", "-ec", code], check=True, capture_output=True)
         return
     for words in filter(None, lines):
         result = CliRunner().invoke(main, words[1:], catch_exceptions=False)

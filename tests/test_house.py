@@ -17,6 +17,7 @@ LAYERS = [
     {"geometry", "outline", "raster", "workers"},
     {"design"},
     {"background", "board", "cells", "draw", "sidecar", "tiling"},
+    {"tags"},
     {"sheet", "analysis", "search", "design_figure"},
     {"scene", "degrade"},
     {"camera"},
@@ -24,6 +25,7 @@ LAYERS = [
     {"synth", "suite", "samples", "recipe"},
     {"match"},
     {"refine"},
+    {"program"},
     {"detect"},
     {"assignment"},
     {"metrics", "bootstrap"},
@@ -33,25 +35,16 @@ LAYERS = [
     {"exhibits", "interchange"},
     {"report"},
     {"pipeline"},
+    {"bench"},
 ]
 EVALUATOR = {
-    *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "detect", "store", "sources"),
-    *(
-        "breakpoints",
-        "charts",
-        "comparison",
-        "exhibits",
-        "gallery",
-        "interchange",
-        "paper",
-        "preview",
-        "report",
-        "tables",
-    ),
+    *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "program", "detect", "store"),
+    *("sources", "breakpoints", "charts", "comparison", "exhibits", "gallery", "interchange", "paper", "preview"),
+    *("report", "tables"),
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
-    *("background", "scene", "degrade", "camera", "synth", "suite", "samples"),
+    *("background", "tags", "scene", "degrade", "camera", "synth", "suite", "samples"),
 }
 TORCH = {"network", "train", "export"}
 

@@ -25,6 +25,7 @@ COMMANDS = {
     "detect": ("detecting:detect", "Run a detector over a dataset or image files."),
     "score": ("scoring:score", "Score a predictions file with the paper's metrics."),
     "compare": ("scoring:compare", "Compare detectors on the same images, pair by pair."),
+    "bench": ("benching:bench", "Suites, detectors and scores in one go, beside the paper's tables."),
     "train": ("training:train", "Train the detector; needs kpbench[train]."),
     "export-model": ("training:export_model", "Write trained weights as an ONNX file."),
     "demo": ("demo:demo", "The whole chain, small, in about a minute."),

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-__all__ = ["FINITE", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
+__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
 
 
 class Size(click.ParamType[tuple[int, int]]):
@@ -26,6 +26,15 @@ class Size(click.ParamType[tuple[int, int]]):
         return width, height
 
 
+class Names(click.ParamType[tuple[str, ...]]):
+    """Names with commas between them, as a tuple."""
+
+    name = "NAME,…"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        return value if isinstance(value, tuple) else tuple(filter(None, map(str.strip, str(value).split(","))))
+
+
 class Finite(click.FloatRange):
     """A number within a range that is neither nan nor infinite, which click lets pass."""
 
@@ -38,6 +47,7 @@ class Finite(click.FloatRange):
 
 SIZE = Size()
 FINITE = Finite()
+ONLY = click.option("--only", type=Names(), default="", help="Only these conditions, such as scale,blur.")
 SEED = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
 WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Processes; default: one a core.")
 PATCHES = click.option(

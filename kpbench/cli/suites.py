@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.options import FINITE, SEED, SIZE, WORKERS
+from kpbench.cli.options import FINITE, ONLY, SEED, SIZE, WORKERS
 
 __all__ = ["degrade", "suite"]
 
@@ -35,8 +35,9 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @SEED
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
 @click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
-@click.option("--only", metavar="CONDITION,…", help="Only these conditions, such as scale,blur.")
+@ONLY
 @click.option("--distortion", type=Distortion(), help="Lens distortion as OpenCV's coefficients; default: none.")
+@click.option("--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Tags in the place of patches.")
 @WORKERS
 @click.option("--resume", is_flag=True, help="Finish an interrupted run.")
 @click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
@@ -47,8 +48,9 @@ def suite(
     seed: int,
     backgrounds: Path | None,
     size: tuple[int, int] | None,
-    only: str | None,
+    only: tuple[str, ...],
     distortion: tuple[float, ...] | None,
+    board: str | None,
     workers: int | None,
     resume: bool,
     overwrite: bool,
@@ -59,13 +61,13 @@ def suite(
     Examples:
       kpbench suite paper-v1 --images 20 --size 640x480
       kpbench suite paper-v1 --only scale,blur --backgrounds photos/ --out scale-and-blur
+      kpbench suite paper-v1 --board aruco
     """
     from kpbench.cli.progress import write_dataset
     from kpbench.suite import SuiteConfig, load_suite
 
-    chosen = () if only is None else tuple(part.strip() for part in only.split(",") if part.strip())
-    config = SuiteConfig(load_suite(name), images, seed, size, chosen, backgrounds, distortion or ())
-    write_dataset(config, out or Path("kpbench-suite") / config.suite.name, workers, resume, overwrite, "suite")
+    config = SuiteConfig(load_suite(name), images, seed, size, only, backgrounds, distortion or (), board)
+    write_dataset(config, out or Path("kpbench-suite") / config.name, workers, resume, overwrite, "suite")
 
 
 @click.command()

@@ -1,0 +1,221 @@
+"""The benchmark: suites, detectors over them, scores; what is done is kept, and an interrupted run goes on.
+
+Everything lies in one folder, under names that hold what it was made from: a dataset's by its config, predictions
+by the dataset's fingerprint and the detector's. So nothing that is found there can be stale, and nothing has
+to be told to be resumed. Scoring takes seconds and is always done again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import re
+import shlex
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpbench import __version__, store
+from kpbench.design import shipped_patches
+from kpbench.detect import DETECTORS, PROGRAM, LoadedDetector, load_detector
+from kpbench.errors import DataError
+from kpbench.pipeline import detect_some, generate
+from kpbench.predictions import Predictions, read_predictions, write_predictions
+from kpbench.scoring import Scores, score
+from kpbench.suite import SuiteConfig
+from kpbench.workers import Progress, run_pieces
+
+__all__ = ["Benched", "bench", "images_to_do"]
+
+PART = 32  # images whose detections are kept together
+
+
+@dataclass(frozen=True)
+class Benched:
+    """One detector on one suite.
+
+    Attributes
+    ----------
+    config : SuiteConfig
+        With the board that the detector looks for.
+    dataset : Dataset
+    predictions : Path
+    scores : Scores
+    failures : tuple of (image_id, message)
+        Images on which the detector raised; they count as no detections.
+    """
+
+    config: SuiteConfig
+    dataset: store.Dataset
+    predictions: Path
+    scores: Scores
+    failures: tuple[tuple[int, str], ...]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """Some images of a dataset, to be shown to a detector, and the file for what it finds."""
+
+    dataset: Path
+    detector: str
+    first: int
+    count: int
+    file: Path
+
+
+def images_to_do(suites: Sequence[SuiteConfig], detectors: Sequence[str]) -> int:
+    """How often ``progress`` of :func:`bench` will count: images made and images looked at."""
+    boards = [load_detector(name).board for name in detectors]
+    return sum(replace(suite, board=board).n for suite in suites for board in [*set(boards), *boards])
+
+
+def bench(
+    suites: Sequence[SuiteConfig],
+    detectors: Sequence[str],
+    out: str | Path,
+    *,
+    workers: int | None = None,
+    progress: Progress = lambda images: None,
+) -> list[Benched]:
+    """Run detectors over suites, each on its own board, and score them.
+
+    Parameters
+    ----------
+    suites : sequence of SuiteConfig
+        Their ``board`` does not count.
+    detectors : names, see :func:`kpbench.detect.load_detector`.
+    out : folder; made if it is not there. What an earlier run finished there is taken over.
+    workers : processes; None for one a core. Changes no result.
+    progress : called as images are made and looked at.
+
+    Returns
+    -------
+    list of Benched
+        By suite, then by detector.
+
+    Raises
+    ------
+    DataError
+        If a detector cannot be loaded, two have one name, or a dataset cannot be made.
+    """
+    loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
+    labels = [detector.name for detector in loaded.values()]
+    if len(set(labels)) < len(labels):
+        raise DataError(f"two detectors share a name, among: {', '.join(labels)}")
+    datasets: dict[SuiteConfig, store.Dataset] = {}
+    runs: list[tuple[SuiteConfig, store.Dataset, Path]] = []
+    parts: list[_Part] = []
+    for suite in suites:
+        for name, detector in loaded.items():
+            config = replace(suite, board=detector.board)
+            if config not in datasets:
+                datasets[config] = _make(config, Path(out) / "suites", workers, progress)
+            dataset = datasets[config]
+            folder = Path(out) / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
+            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_mark(name, detector)[:8]}.json"
+            runs.append((config, dataset, file))
+            if file.exists():
+                progress(len(dataset))
+            else:
+                parts += _parts(dataset, name, file)
+    _detect(parts, workers, progress)
+    for _, _, file in runs:
+        if not file.exists():
+            _join(file)
+    return [_scored(*run) for run in runs]
+
+
+def _make(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> store.Dataset:
+    made_of = store.canonical_json([__version__, config.to_dict()]).encode()
+    place = folder / f"{config.name}-{hashlib.sha256(made_of).hexdigest()[:8]}"
+    if (place / store.MANIFEST).exists():
+        progress(config.n)
+        return store.open_dataset(place)
+    return generate(config, place, workers=workers, resume=True, progress=progress).dataset
+
+
+def _mark(name: str, detector: LoadedDetector) -> str:
+    """Digest of what makes a detector what it is: its name, its version, and the files of its code and weights.
+
+    Of a detector from elsewhere only the file that it is named by is seen: if that reads others, its
+    ``version`` must tell.
+    """
+    if name.startswith(PROGRAM):
+        files = [Path(word) for word in shlex.split(name.removeprefix(PROGRAM)) if Path(word).is_file()]
+    else:
+        module = importlib.import_module(DETECTORS.get(name, name).partition(":")[0])
+        files = [Path(module.__file__)] if module.__file__ else []
+    package = Path(__file__).parent
+    if any(package in file.parents for file in files):
+        code = [path for path in package.rglob("*.py") if path.parent.name != "cli"]
+        files = sorted([*code, *(package / "weights").iterdir()])
+    digest = hashlib.sha256(f"{name} {detector.version} {[p.digest for p in shipped_patches()]}".encode())
+    for file in files:
+        digest.update(hashlib.sha256(file.read_bytes()).digest())
+    return digest.hexdigest()
+
+
+def _parts(dataset: store.Dataset, detector: str, file: Path) -> list[_Part]:
+    """The parts of a predictions file, in a folder beside it until all are there."""
+    folder = file.with_suffix(".parts")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+    return [
+        _Part(dataset.path, detector, first, min(PART, len(dataset) - first), folder / f"{first:08d}.json")
+        for first in range(0, len(dataset), PART)
+    ]
+
+
+def _detect(parts: Sequence[_Part], workers: int | None, progress: Progress) -> None:
+    todo = [part for part in parts if not part.file.exists()]
+    progress(sum(part.count for part in parts) - sum(part.count for part in todo))
+    for _ in run_pieces(_detect_part, todo, workers, progress):
+        pass
+
+
+def _detect_part(part: _Part, progress: Progress) -> None:
+    dataset = _opened(part.dataset)
+    images = range(part.first, part.first + part.count)
+    found = detect_some(dataset, part.detector, None, images, progress)
+    detector = load_detector(part.detector)
+    ids = [int(dataset.truth.image_id[n]) for n in images]
+    failures = [[image_id, found[n][1]] for n, image_id in zip(images, ids, strict=True) if found[n][1]]
+    about = {"name": detector.name, "version": detector.version} | _said(failures)
+    kept = Predictions.from_detections(
+        [found[n][0] for n in images], ids, about, str(dataset.path), dataset.fingerprint
+    )
+    write_predictions(part.file, kept)
+
+
+def _said(failures: list[list[Any]]) -> dict[str, Any]:
+    """What a predictions file says of the images on which its detector raised."""
+    return {"failures": failures} if failures else {}
+
+
+@cache
+def _opened(path: Path) -> store.Dataset:
+    return store.open_dataset(path)
+
+
+def _join(file: Path) -> None:
+    """One predictions file of all its parts, which are then removed."""
+    folder = file.with_suffix(".parts")
+    parts = [read_predictions(path) for path in sorted(folder.iterdir())]
+    about = parts[0].detector | _said([failure for part in parts for failure in part.detector.get("failures", [])])
+    found = [detections for part in parts for detections in part.detections()]
+    ids = np.concatenate([part.image_id for part in parts])
+    write_predictions(file, Predictions.from_detections(found, ids, about, parts[0].dataset, parts[0].fingerprint))
+    shutil.rmtree(folder)
+
+
+def _scored(config: SuiteConfig, dataset: store.Dataset, file: Path) -> Benched:
+    predictions = read_predictions(file)
+    failures = tuple((int(image_id), str(said)) for image_id, said in predictions.detector.get("failures", []))
+    return Benched(config, dataset, file, score(dataset, predictions), failures)

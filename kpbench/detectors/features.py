@@ -1,0 +1,34 @@
+"""ORB and SIFT as OpenCV has them: points without identities, as a measure of what a general detector finds.
+
+Neither knows what a patch is, so most of what they return are false alarms. Defaults of OpenCV; both give at
+most 500 points.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from kpbench.detect import to_grey
+from kpbench.keypoints import Detections, UInt8
+
+__all__ = ["orb", "sift"]
+
+
+def orb(image: UInt8) -> Detections:
+    """Detections without identities of one image, uint8 (H, W) or RGB (H, W, 3), strongest first."""
+    return _points(cv2.ORB.create(), image)
+
+
+def sift(image: UInt8) -> Detections:
+    """Detections without identities of one image, uint8 (H, W) or RGB (H, W, 3), strongest first."""
+    return _points(cv2.SIFT.create(nfeatures=500), image)
+
+
+def _points(detector: cv2.Feature2D, image: UInt8) -> Detections:
+    """Each place once: one with several directions is several features, but one point."""
+    found = sorted(detector.detect(to_grey(image), None), key=lambda p: (-p.response, p.pt))
+    strongest: dict[tuple[float, float], float] = {}
+    for point in found:
+        strongest.setdefault((point.pt[0], point.pt[1]), point.response)
+    return Detections(np.array(list(strongest)), np.array(list(strongest.values())), None)

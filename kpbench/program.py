@@ -1,0 +1,59 @@
+"""Detectors that are programs: images go out as PNG files, a predictions file comes back."""
+
+from __future__ import annotations
+
+import shlex
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+
+from kpbench.errors import DataError
+from kpbench.keypoints import Detections, UInt8
+from kpbench.predictions import read_predictions
+
+__all__ = ["run_program"]
+
+
+def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
+    """Run ``COMMAND IMAGES OUT``: a folder with 00000000.png, 00000001.png, … and the JSON file to write.
+
+    Parameters
+    ----------
+    command : words as a shell reads them; no shell runs them.
+    images : sequence of ndarray, (H, W) grey or (H, W, 3) RGB, uint8
+        ``image_id`` n in the predictions file is the n-th.
+
+    Returns
+    -------
+    list of Detections
+        One an image.
+
+    Raises
+    ------
+    DataError
+        If the program cannot be started, ends with another code than 0, or says nothing of an image.
+    PredictionsError
+        If what it wrote is no predictions file.
+    """
+    with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
+        folder, out = Path(scratch) / "images", Path(scratch) / "predictions.json"
+        folder.mkdir()
+        for n, image in enumerate(images):
+            if not cv2.imwrite(str(folder / f"{n:08d}.png"), image if image.ndim == 2 else image[..., ::-1]):
+                raise DataError(f"{folder}: cannot be written, is the disk full?")
+        try:
+            done = subprocess.run([*shlex.split(command), str(folder), str(out)], capture_output=True, text=True)
+        except OSError as error:
+            raise DataError(f"{command}: cannot be started, {error.strerror}") from None
+        if done.returncode:
+            said = done.stderr.strip().splitlines() or ["nothing on stderr"]
+            raise DataError(f"{command}: exit code {done.returncode}, {said[-1]}")
+        found = read_predictions(out)
+    by_image = dict(zip(found.image_id.tolist(), found.detections(), strict=True))
+    missing = [n for n in range(len(images)) if n not in by_image]
+    if missing:
+        raise DataError(f"{command}: no prediction for image {missing[0]:08d}.png")
+    return [by_image[n] for n in range(len(images))]

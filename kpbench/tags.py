@@ -1,0 +1,140 @@
+"""Boards of tags - ArUco, AprilTag, ChArUco - whose corners are keypoints, for the same scenes as boards of patches.
+
+Such a board is a square of black and white modules with one white module around. It has at least the six
+keypoints of :func:`kpbench.board.hexagon_board`, and its tags are as large as the board's side lets them be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.board import HEXAGON_DIAMETER
+from kpbench.keypoints import Float
+from kpbench.outline import circle, flatten
+
+__all__ = ["TAG_BOARDS", "Corner", "TagBoard", "charuco_pattern", "dictionary", "tag_board"]
+
+TAG_BOARDS = ("aruco", "apriltag", "charuco")
+DICTIONARIES = {
+    "aruco": cv2.aruco.DICT_4X4_50,
+    "apriltag": cv2.aruco.DICT_APRILTAG_36h11,
+    "charuco": cv2.aruco.DICT_4X4_50,
+}
+TAGS = 2  # on a diagonal: eight corners, and four tags would be no smaller
+CHARUCO_SQUARES = (4, 3)  # six corners inside
+SQUARE, MARKER = 8, 6  # modules of a ChArUco square and of the marker in it
+
+
+@dataclass(frozen=True)
+class Corner:
+    """A keypoint of a tag board, mm; the circle about it is what a patch's disc is: the measure of ε."""
+
+    patch_id: int
+    x_mm: float
+    y_mm: float
+    diameter_mm: float
+
+    @property
+    def H_patch2board(self) -> Float:
+        """Unit disc to mm of the board frame, ndarray of shape (3, 3)."""
+        radius = self.diameter_mm / 2
+        return np.array([[radius, 0.0, self.x_mm], [0.0, radius, self.y_mm], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True)
+class TagBoard:
+    """A square of modules, mm.
+
+    Attributes
+    ----------
+    name : str
+    side_x_mm, side_y_mm : float
+    keypoints : tuple of Corner
+    black : ndarray of shape (n, n), bool
+        The modules of the whole board, row by row.
+    """
+
+    name: str
+    side_x_mm: float
+    side_y_mm: float
+    keypoints: tuple[Corner, ...]
+    black: NDArray[np.bool_] = field(compare=False, repr=False)
+
+    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+        """As :meth:`kpbench.board.Board.outlines`; all ink is one part."""
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
+        ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]
+        discs = []
+        for k, radius in zip(self.keypoints, radius_px, strict=True):
+            mm = k.diameter_mm / 2
+            discs.append(flatten(circle(k.x_mm, k.y_mm, mm), 1e-3 * mm / float(radius)))
+        return [ink], discs
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is written into a dataset's config."""
+        return {
+            "name": self.name,
+            "side_mm": self.side_x_mm,
+            "modules": ["".join(" #"[int(black)] for black in row) for row in self.black],
+            "keypoints": [[k.patch_id, k.x_mm, k.y_mm, k.diameter_mm] for k in self.keypoints],
+        }
+
+
+def dictionary(board: str) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of a board's tags."""
+    return cv2.aruco.getPredefinedDictionary(DICTIONARIES[board])
+
+
+def charuco_pattern() -> cv2.aruco.CharucoBoard:
+    """The ChArUco pattern in OpenCV's own words, lengths in modules."""
+    return cv2.aruco.CharucoBoard(CHARUCO_SQUARES, SQUARE, MARKER, dictionary("charuco"))
+
+
+@lru_cache
+def tag_board(name: str, side_mm: float) -> TagBoard:
+    """One of :data:`TAG_BOARDS` on a square of a given side.
+
+    ``aruco`` and ``apriltag`` carry tags 0 and 1; corner c of tag t, clockwise from its top left, is keypoint
+    4 t + c. ``charuco`` has the six inner corners of 4 x 3 squares, numbered as OpenCV does.
+    """
+    black, corners = _charuco() if name == "charuco" else _two_tags(name)
+    module_mm = side_mm / len(black)
+    at_mm = (np.array(list(corners.values())) - len(black) / 2) * module_mm
+    keypoints = tuple(
+        Corner(n, float(x), float(y), HEXAGON_DIAMETER * side_mm) for n, (x, y) in zip(corners, at_mm, strict=True)
+    )
+    return TagBoard(name, side_mm, side_mm, keypoints, black)
+
+
+Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
+"""The board's modules, and its keypoints by id: columns and rows of modules from the top left."""
+
+
+def _two_tags(name: str) -> Modules:
+    tags = dictionary(name)
+    width = tags.markerSize + 2
+    black = np.zeros((TAGS * (width + 1) + 1,) * 2, bool)
+    corners = {}
+    for tag in range(TAGS):
+        first = 1 + tag * (width + 1)
+        black[first : first + width, first : first + width] = tags.generateImageMarker(tag, width) == 0
+        for corner, (x, y) in enumerate([(0, 0), (width, 0), (width, width), (0, width)]):
+            corners[4 * tag + corner] = (float(first + x), float(first + y))
+    return black, corners
+
+
+def _charuco() -> Modules:
+    pattern = charuco_pattern()
+    columns, rows = (SQUARE * squares for squares in CHARUCO_SQUARES)
+    black = np.zeros((columns + 2,) * 2, bool)
+    top = (len(black) - rows) // 2
+    black[top : top + rows, 1 : columns + 1] = pattern.generateImage((columns, rows)) == 0
+    inside = np.asarray(pattern.getChessboardCorners())[:, :2] + (1, top)
+    return black, {n: (float(x), float(y)) for n, (x, y) in enumerate(inside)}
