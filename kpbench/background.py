@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
+from kpbench.files import IMAGE_SUFFIXES, image_files
 from kpbench.keypoints import UInt8
 
 __all__ = ["Background", "PhotoFolder", "procedural"]
 
-SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 CACHE_BYTES = 128 * 2**20
 
 
@@ -64,11 +64,10 @@ class PhotoFolder:
         if not folder.is_dir():
             what = "a file, expected a folder" if folder.exists() else "no such folder"
             raise DataError(f"{folder}: {what} of background images")
-        files = tuple(
-            sorted(f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES)
-        )
+        files = image_files(folder)
         if not files:
-            raise DataError(f"{folder}: no background images in it, expected files ending in {', '.join(SUFFIXES)}")
+            expected = ", ".join(IMAGE_SUFFIXES)
+            raise DataError(f"{folder}: no background images in it, expected files ending in {expected}")
         photos = cls(folder, files)
         if all(photos.decode(name, 1) is None for name in files):
             raise DataError(f"{folder}: none of its {len(files)} image files can be decoded, first is {files[0]}")

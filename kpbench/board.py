@@ -7,7 +7,6 @@ Board frame: mm, x right, y down, z away from the viewer, the origin is the boar
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from kpbench.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
+from kpbench.files import read_toml
 from kpbench.geometry import project
 from kpbench.keypoints import Float
 from kpbench.outline import cos_sin_deg
@@ -244,12 +244,7 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
         One line that names the file, the key and what was expected.
     """
     path = Path(path)
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise DesignError(f"{path}: cannot be read ({error})") from None
-    except tomllib.TOMLDecodeError as error:
-        raise DesignError(f"{path}: not valid TOML ({error})") from None
+    table = read_toml(path, DesignError)
     if "designs" in table:
         files = table["designs"]
         if not isinstance(files, list) or not files or not all(isinstance(f, str) for f in files):

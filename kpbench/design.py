@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.errors import DesignError
+from kpbench.files import read_toml
 from kpbench.keypoints import Float
 from kpbench.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
 
@@ -330,15 +330,7 @@ def load_patch(path: str | Path) -> Patch:
     DesignError
         If it cannot be read, is no TOML, or is no design.
     """
-    try:
-        table = tomllib.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise DesignError(f"{path}: cannot be read, {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DesignError(f"{path}: cannot be read, not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
-        raise DesignError(f"{path}: not valid TOML ({error})") from None
-    return parse_patch(table, str(path))
+    return parse_patch(read_toml(path, DesignError), str(path))
 
 
 def load_patches(paths: Sequence[str | Path]) -> tuple[Patch, ...]:

@@ -29,7 +29,8 @@ __all__ = ["INK", "WRITERS", "Page", "Shape", "Text", "mirror", "px_per_mm"]
 
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
-FONT = "Helvetica"
+SVG_FONTS = "Helvetica, Arial, sans-serif"
+PDF_FONT = "Vera"  # comes with reportlab, may be embedded freely
 PT_PER_MM = 72 / 25.4
 MAX_PIXELS = 1_000_000_000
 
@@ -138,7 +139,7 @@ def svg(page: Page) -> bytes:
         lines.append(f'<g id="{layer}" fill="#000" fill-rule="nonzero">')
         lines += [f'<path d="{_svg_path(s.region)}"/>' for s in page.shapes if s.layer == layer]
         lines.append("</g>")
-    lines.append(f'<g id="TEXT" font-family="{FONT}, Arial, sans-serif">')
+    lines.append(f'<g id="TEXT" font-family="{SVG_FONTS}">')
     for t in page.texts:
         place = f'transform="matrix(-1 0 0 1 {_mm(t.x, t.y)})"' if t.mirrored else f'x="{_mm(t.x)}" y="{_mm(t.y)}"'
         lines.append(f'<text {place} font-size="{_mm(t.size)}" text-anchor="{t.anchor}">{escape(t.clean)}</text>')
@@ -149,15 +150,19 @@ def svg(page: Page) -> bytes:
 
 
 def pdf(pages: Sequence[Page]) -> bytes:
-    """All pages as one PDF: filled paths only, and a request to the viewer not to scale.
+    """All pages as one PDF: filled paths only, text in an embedded font, and a request to the viewer not to scale.
 
     An arc becomes cubic Béziers of at most 22.5 degrees, with control points at ``4/3 tan(sweep/4)``
     radii along the tangents; the edge is then off by less than 1e-7 of the radius.
     """
+    from reportlab.pdfbase import pdfmetrics
+    from reportlab.pdfbase.ttfonts import TTFont
     from reportlab.pdfgen.canvas import FILL_NON_ZERO, Canvas
 
+    font = TTFont(PDF_FONT, "Vera.ttf")
+    pdfmetrics.registerFont(font)
     out = io.BytesIO()
-    canvas = Canvas(out, invariant=1, pageCompression=0, initialFontName=FONT, lang="en")
+    canvas = Canvas(out, invariant=1, pageCompression=0, initialFontName=PDF_FONT, lang="en")
     canvas.setTitle(pages[0].title)
     canvas.setAuthor("kpbench")
     canvas.setCreator("kpbench")
@@ -175,9 +180,9 @@ def pdf(pages: Sequence[Page]) -> bytes:
         for text in page.texts:
             canvas.saveState()
             canvas.transform(-1 if text.mirrored else 1, 0, 0, 1, text.x * PT_PER_MM, height - text.y * PT_PER_MM)
-            canvas.setFont(FONT, text.size * PT_PER_MM)
+            canvas.setFont(PDF_FONT, text.size * PT_PER_MM)
             draw = {"start": canvas.drawString, "middle": canvas.drawCentredString, "end": canvas.drawRightString}
-            draw[text.anchor](0, 0, text.clean.encode("cp1252", "replace").decode("cp1252"))
+            draw[text.anchor](0, 0, "".join(c if ord(c) in font.face.charToGlyph else "?" for c in text.clean))
             canvas.restoreState()
         canvas.showPage()
     canvas.save()

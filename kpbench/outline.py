@@ -7,7 +7,6 @@ An outline never knows where it will be drawn.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,10 +116,3 @@ def _vertices(part: Line | Arc, tolerance: float) -> Float:
     if abs(part.sweep_deg) < 360:
         points[0] = part.point(0.0)
     return points
-
-
-def bounds(polygons: Sequence[Float]) -> tuple[float, float, float, float]:
-    """Smallest and largest x and y over all vertices: (x_min, y_min, x_max, y_max)."""
-    points = np.concatenate(list(polygons))
-    (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
-    return float(x0), float(y0), float(x1), float(y1)

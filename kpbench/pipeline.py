@@ -56,6 +56,10 @@ class Recipe(Protocol):
         """The config that is written into the dataset: no path of this machine."""
         ...
 
+    def scene(self, index: int) -> int:
+        """The base scene of an image; shards are made scene by scene, as what a scene needs is kept."""
+        ...
+
     def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
         """One image, and the broken background files met on the way."""
         ...
@@ -108,7 +112,7 @@ def generate(
     with _locked(folder):
         plan = _plan(config)
         done = _prepare(folder, config, written, plan, resume, overwrite)
-        todo = [piece for piece in plan if piece[0] not in done]
+        todo = sorted((piece for piece in plan if piece[0] not in done), key=lambda piece: config.scene(piece[1]))
         _check_space(folder, config.image_bytes, sum(count for _, _, count in todo))
         progress(sum(done[name][0].count for name in done))
         results = dict(done)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
+from kpbench.files import read_toml
 from kpbench.samples import SampleConfig
 
 __all__ = ["Loss", "NetworkConfig", "Phase", "Recipe", "load_recipe", "parse_recipe"]
@@ -185,15 +185,7 @@ def load_recipe(path: str | Path) -> Recipe:
     DataError
         If it cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
     """
-    try:
-        table = tomllib.loads(Path(path).read_text("utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: cannot be read, not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: not valid TOML ({error})") from None
-    return parse_recipe(table, str(path))
+    return parse_recipe(read_toml(path, DataError), str(path))
 
 
 def parse_recipe(table: Any, source: str) -> Recipe:

@@ -350,8 +350,8 @@ def _polygon(points: Iterable[tuple[float, float]]) -> Region:
 
 
 def _fitting(text: str, room: float) -> float:
-    """Font size in mm: Helvetica is about half as wide as high."""
-    return max(min(FONT_SIZE, room / (0.52 * len(text))), 0.5)
+    """Font size in mm: no font that is used is wider than 0.6 of its size on average, in digits and lower case."""
+    return max(min(FONT_SIZE, room / (0.6 * len(text))), 0.5)
 
 
 def _floored(diameter: float) -> str:

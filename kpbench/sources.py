@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
+from kpbench.files import IMAGE_SUFFIXES, image_files
 from kpbench.keypoints import UInt8
 
 __all__ = ["Source", "image_writer", "open_images"]
 
-IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 
 
@@ -46,10 +46,10 @@ def open_images(source: str) -> Source:
             raise DataError(f"{source}: expected camera:0, camera:1, …")
         return _video(cv2.VideoCapture(int(number)), source, None)
     if path.is_dir():
-        files = sorted(f for f in path.rglob("*") if f.suffix.lower() in IMAGES)
+        files = image_files(path)
         if not files:
-            raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGES)})")
-        return Source(((f.relative_to(path).as_posix(), _decode(f)) for f in files), len(files))
+            raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
+        return Source(((name, _decode(path / name)) for name in files), len(files))
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEOS:

@@ -8,7 +8,6 @@ images share their ``scene_id``; so do the random numbers of the effects. Compar
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +24,7 @@ from kpbench.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
+from kpbench.files import read_toml
 from kpbench.geometry import Camera
 from kpbench.scene import measure_contrast, stream
 from kpbench.tags import TAG_BOARDS, tag_board
@@ -33,7 +33,6 @@ __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "load_suite", "shipped_s
 
 SCHEMA = "kpbench.suite/1"
 BOARD_SIDE_MM = 187.5  # a disc of 30 mm
-KEPT_BYTES = 256 * 2**20  # of backgrounds in memory; changes no result
 # Streams of random numbers of one scene; 0 to 2 belong to synth
 BACKGROUND, SCENE, EFFECT, FIELD = range(16, 20)
 
@@ -225,13 +224,14 @@ class SuiteConfig:
             **shown,
         }
 
-    def shot(self, index: int) -> Shot:
-        """Pose, light, effects and truth of one image; nothing is painted.
+    def scene(self, index: int) -> int:
+        """The base scene of an image: images are ordered by condition, rung, board and scene."""
+        return index % self.scenes
 
-        Images are ordered by condition, rung, board and scene.
-        """
-        rest, scene = divmod(index, self.scenes)
-        rung, which = divmod(rest, len(self.boards))
+    def shot(self, index: int) -> Shot:
+        """Pose, light, effects and truth of one image; nothing is painted."""
+        scene = self.scene(index)
+        rung, which = divmod(index // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
         rng = stream(self.seed, scene, SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
@@ -267,7 +267,7 @@ class SuiteConfig:
         return sample, background.broken
 
     def _background(self, scene: int) -> Background:
-        """The background of a scene; the first ones that fit are kept, as every scene comes back under each rung."""
+        """The background of a scene; as many as a shard holds are kept, as every scene comes back under each rung."""
         if scene in self._kept:
             return self._kept[scene]
         rng, (width, height) = stream(self.seed, scene, BACKGROUND), (self.camera.width_px, self.camera.height_px)
@@ -275,8 +275,9 @@ class SuiteConfig:
             background = Background(procedural(rng, width, height))
         else:
             background = self.photos.sample(rng, width, height, 1)
-        if len(self._kept) < KEPT_BYTES // background.image.nbytes:
-            self._kept[scene] = background
+        if len(self._kept) >= self.shard_size:
+            del self._kept[next(iter(self._kept))]
+        self._kept[scene] = background
         return background
 
 
@@ -306,14 +307,7 @@ def load_suite(name: str) -> Suite:
     path = shipped.get(name, Path(name))
     if name not in shipped and path.suffix != ".toml":
         raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
-    try:
-        table = tomllib.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{path}: cannot be read, not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f"{path}: not valid TOML ({error})") from None
+    table = read_toml(path, DataError)
     try:
         return _parse_suite(table)
     except (DesignError, DataError) as error:

@@ -96,6 +96,10 @@ class SynthConfig:
         width, height = self.size_px
         return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
 
+    def scene(self, index: int) -> int:
+        """Every image is a scene of its own."""
+        return index
+
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         """Image ``index`` of the set, and the broken background files met on the way.
 

@@ -1,11 +1,15 @@
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
+from kpbench.design import load_patches
 from kpbench.pipeline import generate
 from kpbench.predictions import read_predictions
+from kpbench.scene import Limits
 from kpbench.synth import SynthConfig
 
 MODULE = """
@@ -160,3 +164,18 @@ def test_mistakes_in_a_detector_of_ones_own_are_one_line_and_keep_older_predicti
     assert says in result.stderr
     assert result.stderr.count("\n") == 1
     assert (folder / "preds.json").read_text() == "earlier"
+
+
+def test_template_looks_for_the_designs_it_is_told(folder):
+    other = Path(__file__).parent.parent / "benchmarks" / "designs" / "runner-up" / "007f4f4f.toml"
+    limits = Limits(count=(1, 1), radius_px=(20, 40), tilt_deg=30)
+    generate(
+        SynthConfig(4, size_px=(160, 120), deteriorate="none", patches=load_patches([other]), limits=limits), "set"
+    )
+    assert run("set", "--patches", other).exit_code == 0
+    ids = read_predictions("preds.json").patch_id
+    assert len(ids) >= 3
+    assert set(ids) == {4}
+    refused = run("set", "--patches", other, "--detector", "superpoint-small")
+    assert refused.exit_code == 2
+    assert "--patches is for the template detector" in refused.stderr

@@ -259,3 +259,12 @@ def test_mirrored_pages_are_mirror_images_text_and_all(tmp_path):
         assert np.abs(ink - seen[:, ::-1]).sum() < 0.15 * ink.sum()
         assert np.abs(ink - seen).sum() > ink.sum()
     assert svg(mirror(page)).count(b"matrix(-1 0 0 1 ") == 2
+
+
+def test_the_pdf_embeds_its_font():
+    """Print shops refuse a PDF that leaves the font to them."""
+    page = Page(60.0, 40.0, (), (Text("30 mm, \u4e2d", 5, 10, 3),), "t")
+    document = pikepdf.open(io.BytesIO(pdf([page])))
+    fonts = document.pages[0].Resources.Font
+    assert len(fonts) == 1
+    assert all("/FontFile2" in font.FontDescriptor for font in fonts.values())

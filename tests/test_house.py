@@ -14,7 +14,7 @@ PACKAGE = Path(kpbench.__file__).parent
 # Each module may import those of its own line and of the lines before it.
 LAYERS = [
     {"errors", "keypoints"},
-    {"geometry", "outline", "raster", "workers"},
+    {"files", "geometry", "outline", "raster", "workers"},
     {"design"},
     {"background", "board", "cells", "draw", "sidecar", "tiling"},
     {"tags"},

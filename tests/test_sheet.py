@@ -6,6 +6,7 @@ import shutil
 import subprocess
 
 import numpy as np
+import pypdfium2
 import pytest
 import readers
 from PIL import Image
@@ -330,6 +331,14 @@ def test_poppler_sees_the_keypoints_too(tmp_path):
     sheet = SHEETS["mixed"]
     (grey,) = poppler(pdf(sheet.pages), tmp_path, 300)
     check_raster(sheet, grey, 300 / 25.4, 0.2)  # it samples each pixel 4 x 4 times
+
+
+def test_pdfium_sees_the_keypoints_too():
+    """It places an edge anywhere in a pixel, but stretches a page to whole pixels, as this one is."""
+    sheet, dpi = board_sheet(MIXED, Paper(254, 381)), 300
+    drawn = pypdfium2.PdfDocument(pdf(sheet.pages))[0].render(scale=dpi / 72, grayscale=True).to_numpy()
+    assert drawn.shape[:2] == (4500, 3000)
+    check_raster(sheet, drawn.reshape(4500, 3000).astype(float), dpi / 25.4, 0.05)
 
 
 @pytest.mark.skipif(not shutil.which("rsvg-convert"), reason="needs librsvg")

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import kpbench.suite
 from kpbench import degrade, store
+from kpbench.background import procedural
 from kpbench.cli import main
 from kpbench.errors import DataError
 from kpbench.pipeline import generate
@@ -297,3 +299,11 @@ def test_the_help_names_every_effect():
     told = " ".join(run("degrade", "--help").stdout.split())
     for effect in set(degrade.LADDER) - {"dimming-literal"}:
         assert effect in told
+
+
+def test_a_background_is_made_once_though_every_rung_shows_it(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(kpbench.suite, "procedural", lambda *a: made.append(a) or procedural(*a))
+    config = SuiteConfig(load_suite("paper-v1"), images=6, size_px=(64, 64), only=("blur",), shard_size=3)
+    assert len(generate(config, tmp_path / "a", workers=1).dataset) == 6 * 4 * 4
+    assert len(made) == 6

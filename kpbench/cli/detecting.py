@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from kpbench.cli.options import FINITE, WORKERS
+from kpbench.cli.options import FINITE, PATCHES, WORKERS
+
+if TYPE_CHECKING:
+    from kpbench.detect import LoadedDetector
 
 __all__ = ["detect"]
 
@@ -17,9 +21,16 @@ __all__ = ["detect"]
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
 @click.option("--threshold", type=FINITE, help="Drop detections of a lower score.")
 @click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
+@PATCHES
 @WORKERS
 def detect(
-    source: str, name: str, out: Path, threshold: float | None, overlay: Path | None, workers: int | None
+    source: str,
+    name: str,
+    out: Path,
+    threshold: float | None,
+    overlay: Path | None,
+    patches: tuple[Path, ...],
+    workers: int | None,
 ) -> None:
     """Run a detector over SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
 
@@ -30,6 +41,7 @@ def detect(
     Examples:
       kpbench detect kpbench-data --detector template --out preds.json
       kpbench detect photos --detector my_module:MyDetector --overlay drawn
+      kpbench detect photos --detector template --patches my-patch.toml
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.pipeline import predict, predict_images
@@ -37,14 +49,15 @@ def detect(
     from kpbench.sources import open_images
     from kpbench.store import open_dataset
 
+    detector = _told(name, patches) if patches else name
     if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
         dataset = open_dataset(source)
         with progress_bar(len(dataset), "detect") as progress:
-            run = predict(dataset, name, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
+            run = predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
     else:
         images = open_images(source)
         with progress_bar(images.length, "detect") as progress:
-            run = predict_images(images, name, threshold=threshold, overlay=overlay, progress=progress)
+            run = predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
     write_predictions(out, run.predictions)
     click.echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
     if run.failures:
@@ -52,3 +65,15 @@ def detect(
             click.echo(f"kpbench: {label}: {problem}", err=True)
         click.echo(f"kpbench: {len(run.failures)} images failed, they count as no detections", err=True)
         raise SystemExit(1)
+
+
+def _told(name: str, patches: tuple[Path, ...]) -> LoadedDetector:
+    """The detector that compares images with designs, told which; it then runs in this process alone."""
+    from kpbench.design import load_patches
+    from kpbench.detect import LoadedDetector
+    from kpbench.detectors.template import TemplateDetector
+
+    if name != "template":
+        raise click.UsageError(f"--patches is for the template detector; {name} has designs of its own")
+    made = TemplateDetector(load_patches(patches))
+    return LoadedDetector(made.name, made.version, made)
