@@ -35,6 +35,7 @@ DETECTORS = {
     "charuco": "kpbench.detectors.tags:CharucoDetector",
 }
 """Name → where the shipped detector is, as ``MODULE:ATTR``."""
+SUPERPOINT = "kpbench.detectors.superpoint:SuperPointDetector"
 
 PROGRAM = "program:"
 """What the name of a detector begins with that is a program, see :func:`kpbench.program.run_program`."""
@@ -92,10 +93,11 @@ class LoadedDetector:
 
 
 def load_detector(name: str) -> LoadedDetector:
-    """A shipped detector by name, one of yours by ``MODULE:ATTR``, or a program by ``program:COMMAND``.
+    """A shipped detector by name; yours as weights ``FILE.onnx``, ``MODULE:ATTR``, or ``program:COMMAND``.
 
-    ``ATTR`` may be a function of an image, an object with a method ``detect`` (or that can be called), or a
-    class that gives such an object when called without arguments. Modules in the current folder are found.
+    A file is one that ``kpbench export-model`` wrote. ``ATTR`` may be a function of an image, an object with a
+    method ``detect`` (or that can be called), or a class that gives such an object when called without
+    arguments. Modules in the current folder are found.
 
     Raises
     ------
@@ -105,10 +107,13 @@ def load_detector(name: str) -> LoadedDetector:
     if name.startswith(PROGRAM):
         many = partial(run_program, name.removeprefix(PROGRAM).strip())
         return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
+    if name.endswith(".onnx"):
+        made = _resolve(SUPERPOINT)(Path(name))
+        return LoadedDetector(made.name, made.version, made.detect)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
-            f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or MODULE:ATTR or program:COMMAND "
-            "of your own"
+            f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
+            "or program:COMMAND of your own"
         )
     found = _resolve(DETECTORS.get(name, name))
     try:

@@ -108,5 +108,5 @@ def export(checkpoint: str | Path, out: str | Path) -> Exported:
 
 
 def _difference(data: bytes, image: Any, expected: list[Any]) -> float:
-    got = open_session(data).run(None, {"image": image})
+    got = open_session(data)[0].run(None, {"image": image})
     return max(float(np.abs(a - b).max()) for a, b in zip(got, expected, strict=True))

@@ -26,7 +26,20 @@ from numpy.typing import NDArray
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
 
-__all__ = ["RING_PX", "Bank", "Poses", "Templates", "align", "bank", "extend", "pyramid", "search", "short_axis"]
+__all__ = [
+    "RING_PX",
+    "Bank",
+    "Poses",
+    "Templates",
+    "align",
+    "bank",
+    "extend",
+    "likeness",
+    "noise",
+    "pyramid",
+    "search",
+    "short_axis",
+]
 
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -175,6 +188,17 @@ def pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
     while min(levels[-1].shape) >= 16 and len(levels) < 7:
         levels.append(np.asarray(cv2.pyrDown(levels[-1])))
     return levels
+
+
+def noise(image: Float32) -> float:
+    """Standard deviation of noise from the median of second differences, which edges hardly move."""
+    kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
+    return 1.4826 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
+
+
+def likeness(core: Float, whole: Float) -> Float:
+    """What the correlations near the centre and over the disc are worth, in units of log odds."""
+    return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
 
 
 def _sample(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, points: Float) -> Float32:

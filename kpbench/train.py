@@ -92,7 +92,7 @@ def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
         "recipe": asdict(state.recipe),
         "step": state.step,
         "seconds": round(state.seconds, 1),
-        "patches": [{"id": p.patch_id, "name": p.name, "digest": p.digest} for p in patches],
+        "patches": [p.to_dict() for p in patches],
         "designs": designs_digest(patches),
         "versions": {"kpbench": __version__, "torch": torch.__version__},
     }
@@ -247,7 +247,7 @@ def train(
     validate_every: float = 15.0,
     validation_images: int = 32,
     tensorboard: bool = False,
-    patches: Sequence[Patch] | None = None,
+    patches: Sequence[Patch] = shipped_patches(),
     say: Callable[[str], None] = lambda line: None,
 ) -> bool:
     """Train, or go on training; writes ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
@@ -274,8 +274,8 @@ def train(
         Whole images that are validated on, each with and without deteriorations; see :func:`validation_set`.
     tensorboard : bool
         Write the log for TensorBoard too.
-    patches : sequence of Patch, optional
-        The designs, one a channel of the ID head; None: the shipped ones.
+    patches : sequence of Patch
+        The designs, one a channel of the ID head.
     say : callable
         Receives lines for the user.
 
@@ -295,7 +295,7 @@ def train(
     rank, world, device = _place()
     if threads:
         torch.set_num_threads(threads)
-    designs = tuple(patches or shipped_patches())
+    designs = tuple(patches)
     folder = Path(out)
     checkpoint = folder / "checkpoint.safetensors"
     if len(designs) != recipe.network.ids:

@@ -26,6 +26,7 @@ LAYERS = [
     {"match"},
     {"refine"},
     {"program"},
+    {"verify"},
     {"detect"},
     {"assignment"},
     {"metrics", "bootstrap"},

@@ -2,17 +2,16 @@ import json
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from kpbench.design import shipped_patches
-from kpbench.detectors import superpoint
-from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, fit_designs, pad_to_cells
+from kpbench.detect import load_detector
+from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, open_session, pad_to_cells
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections
-from kpbench.scene import Placement, render_scene
 
 PATCHES = shipped_patches()
 
@@ -119,7 +118,7 @@ def brightest_pixel_model(schema="kpbench.superpoint/1"):
         "name": "brightest",
         "designs": "0" * 64,
         "samples": 0,
-        "patches": [{"id": 5}, {"id": 7}],
+        "patches": [PATCHES[0].to_dict() | {"id": 5}, PATCHES[1].to_dict() | {"id": 7}],
     }
     helper.set_model_props(model, {"kpbench": json.dumps(content)})
     onnx.checker.check_model(model)
@@ -130,7 +129,7 @@ def brightest_pixel_model(schema="kpbench.superpoint/1"):
 def detector(tmp_path):
     path = tmp_path / "brightest.onnx"
     path.write_bytes(brightest_pixel_model())
-    return SuperPointDetector(path, patches=None, threads=1)
+    return SuperPointDetector(path, verified=False, threads=1)
 
 
 @pytest.mark.parametrize("shape", [(40, 48), (41, 51), (9, 17), (40, 48, 3)])
@@ -149,41 +148,12 @@ def test_what_lies_in_the_padding_is_no_detection(detector):
     assert np.all(found.xy < (16.5, 8.5))
 
 
-def scene():
-    """Two patches on an even ground, and what a network that errs by a pixel would say of them."""
-    placements = [
-        Placement(PATCHES[1], np.array([[12.0, 2.0, 40.3], [-1.0, 9.0, 30.8], [0.0, 0.001, 1.0]]), 20.0, 230.0),
-        Placement(PATCHES[3], np.array([[0.0, -30.0, 110.6], [30.0, 0.0, 70.1], [0.0005, 0.0, 1.0]]), 40.0, 200.0),
-    ]
-    rendered = render_scene(np.full((128, 160), 120, np.uint8), placements)
-    xy = np.column_stack([rendered.keypoints["x"], rendered.keypoints["y"]])
-    return rendered.image, xy, rendered.keypoints["patch_id"]
-
-
-def test_fitting_the_design_finds_the_centre_to_a_hundredth_of_a_pixel():
-    image, xy, ids = scene()
-    rough = Detections(np.add(xy, [[0.9, -0.8], [-1.0, 1.2]]), [0.9, 0.8], ids)
-    fitted = fit_designs(image, rough, PATCHES)
-    np.testing.assert_allclose(fitted.xy, xy, atol=0.02)
-    assert fitted.score.tolist() == [0.9, 0.8]
-    assert np.array_equal(fitted.patch_id, ids)
-
-
-def test_what_fits_no_design_stays_where_it_was():
-    image, xy, ids = scene()
-    places = np.array([[20.0, 100.0], [xy[0, 0] + 8, xy[0, 1]]])  # bare ground; 8 px beside a centre
-    fitted = fit_designs(image, Detections(places, [0.9, 0.8], [0, ids[0]]), PATCHES)
-    np.testing.assert_array_equal(fitted.xy, places)
-
-
-def test_nothing_to_fit_is_nothing():
-    assert len(fit_designs(np.zeros((40, 40), np.uint8), Detections.none(), PATCHES)) == 0
-
-
-def test_the_detector_fits_the_designs_that_it_is_given(detector, monkeypatch):
-    detector.patches = PATCHES
-    monkeypatch.setattr(superpoint, "fit_designs", lambda grey, found, patches: (grey.shape, len(found), patches))
-    assert detector(np.zeros((16, 24, 3), np.uint8)) == ((16, 24), 0, PATCHES)
+def test_with_verification_a_bright_pixel_is_no_patch(detector):
+    image = np.zeros((64, 64), np.uint8)
+    image[30, 33] = 255
+    assert len(detector(image)) == 1
+    detector.verified = True
+    assert len(detector(image)) == 0
 
 
 @pytest.mark.parametrize(
@@ -208,7 +178,6 @@ def test_a_missing_file_is_named(tmp_path):
 
 def test_the_shipped_weights_find_large_clean_patches():
     """First weights, little trained: an easy scene, so that a wrong file, frame or channel order is seen."""
-    from kpbench.detect import load_detector
     from kpbench.scene import Limits
     from kpbench.synth import SynthConfig
 
@@ -226,3 +195,41 @@ def test_the_shipped_weights_find_large_clean_patches():
                 right += int(detections.patch_id[distance.argmin()] == k["patch_id"])
     assert found >= 0.75 * truths
     assert right >= 0.75 * found
+
+
+def test_a_batch_gives_what_single_images_give(detector):
+    images = np.zeros((3, 41, 51), np.uint8)
+    images[0, 5, 13] = images[2, 30, 40] = 255
+    for together, alone in zip(detector.batch(list(images)), map(detector, images), strict=True):
+        np.testing.assert_allclose(together.xy, alone.xy, atol=1e-4)
+    assert [len(found) for found in detector.batch(list(images))] == [1, 0, 1]
+    assert detector.batch([]) == []
+    with pytest.raises(DataError, match="images of one size"):
+        detector.batch([images[0], images[0, :40]])
+
+
+def test_weights_are_a_detector_by_the_name_of_their_file(tmp_path):
+    path = tmp_path / "own.onnx"
+    path.write_bytes(brightest_pixel_model())
+    assert load_detector(str(path)).name == "brightest"
+    with pytest.raises(DataError, match=r"other\.onnx: cannot be read"):
+        load_detector(str(tmp_path / "other.onnx"))
+
+
+@pytest.mark.parametrize(("asked", "message"), [("fast", "expected one of: auto, cpu"), ("cuda", "has no CUDA")])
+def test_a_runtime_that_is_not_there_is_one_line(monkeypatch, asked, message):
+    monkeypatch.setenv("KPBENCH_RUNTIME", asked)
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CPUExecutionProvider"])
+    with pytest.raises(DataError, match=message):
+        open_session(brightest_pixel_model())
+
+
+def test_openvino_gives_what_onnx_runtime_gives(monkeypatch):
+    pytest.importorskip("openvino")
+    image = {"image": np.random.default_rng(0).random((2, 1, 16, 24), np.float32)}
+    plain = open_session(brightest_pixel_model())[0].run(None, image)
+    monkeypatch.setenv("KPBENCH_RUNTIME", "openvino")
+    other, content = open_session(brightest_pixel_model())
+    assert json.loads(content)["name"] == "brightest"
+    for a, b in zip(plain, other.run(None, image), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-4)

@@ -17,7 +17,7 @@ __all__ = ["detect"]
 
 @click.command()
 @click.argument("source")
-@click.option("--detector", "name", default="template", show_default=True, help="A shipped detector, or MODULE:ATTR.")
+@click.option("--detector", "name", default="template", show_default=True, help="By name, FILE.onnx, or MODULE:ATTR.")
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
 @click.option("--threshold", type=FINITE, help="Drop detections of a lower score.")
 @click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
@@ -42,6 +42,7 @@ def detect(
       kpbench detect kpbench-data --detector template --out preds.json
       kpbench detect photos --detector my_module:MyDetector --overlay drawn
       kpbench detect photos --detector template --patches my-patch.toml
+      kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.pipeline import predict, predict_images

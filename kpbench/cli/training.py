@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.options import PATCHES
+
 __all__ = ["export_model", "train"]
 
 INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
@@ -15,6 +17,7 @@ INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
 @click.option("--config", type=click.Path(path_type=Path), required=True, help="Recipe, TOML.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the run; default: runs/NAME of the recipe.")
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@PATCHES
 @click.option("--init", type=click.Path(path_type=Path), help="SuperPoint weights to start from (.pth, .safetensors).")
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder.")
 @click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
@@ -25,6 +28,7 @@ def train(
     config: Path,
     out: Path | None,
     backgrounds: Path | None,
+    patches: tuple[Path, ...],
     init: Path | None,
     resume: bool,
     minutes: float | None,
@@ -42,6 +46,7 @@ def train(
     """
     if init and resume:
         raise click.UsageError("--init and --resume exclude each other: a checkpoint holds its own weights")
+    from kpbench.design import load_patches, shipped_patches
     from kpbench.recipe import load_recipe
 
     recipe = load_recipe(config)
@@ -60,6 +65,7 @@ def train(
         workers=workers,
         threads=threads,
         tensorboard=tensorboard,
+        patches=load_patches(patches) if patches else shipped_patches(),
         say=lambda line: click.echo(line, err=True),
     )
     click.echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")

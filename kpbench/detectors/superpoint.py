@@ -7,18 +7,20 @@ it, whichever cells that lies in.
 
 from __future__ import annotations
 
+import io
 import json
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import match, refine
-from kpbench.design import Patch, shipped_patches
+from kpbench import verify
+from kpbench.design import parse_patch
 from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
@@ -28,7 +30,8 @@ __all__ = [
     "SmallSuperPointDetector",
     "SuperPointDetector",
     "decode",
-    "fit_designs",
+    "identify",
+    "locate",
     "open_session",
     "pad_to_cells",
 ]
@@ -60,7 +63,7 @@ class Decoding:
 
 
 def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | None = None) -> Detections:
-    """Keypoints from the two heads of one image.
+    """Keypoints from the two heads of one image, as the network alone sees them.
 
     Parameters
     ----------
@@ -75,7 +78,12 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
     Detections
         In the frame of the (8h, 8w) image, best first; ``patch_id`` is the place of the patch in the ID head.
     """
-    how = decoding or Decoding()
+    xy, score = locate(detector_logits, decoding or Decoding())
+    return Detections(xy, score, np.argmax(identify(id_logits, xy)[:, :-1], axis=1))
+
+
+def locate(detector_logits: Float32, how: Decoding) -> tuple[Float, Float]:
+    """Places (n, 2) px and scores (n,) of keypoints from the (65, h, w) detector logits, best first."""
     probability = keypoint_probability(detector_logits)
     reach = how.window_px
     # a light smoothing ranks neighbours within a blob, so that one blob has one maximum
@@ -84,8 +92,6 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
     side = 2 * how.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     rows, columns = np.nonzero((ranked >= highest) & (mass >= how.threshold))
-    if not len(rows):
-        return Detections.none()
     padded = np.pad(probability, reach)
     offset = np.arange(2 * reach + 1)
     windows = padded[rows[:, None, None] + offset[:, None], columns[:, None, None] + offset]
@@ -95,8 +101,14 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
     xy = np.column_stack([x, y])
     score = np.minimum(total, 1.0).astype(np.float64)
     kept = suppress(xy, score, how.separation_px)
-    ids = np.argmax(_at(id_logits, xy[kept])[:, :-1], axis=1)
-    return Detections(xy[kept], score[kept], ids)
+    return xy[kept], score[kept]
+
+
+def identify(id_logits: Float32, xy: Float) -> Float:
+    """Log-probabilities (n, ids + 1) of each patch and of "no patch" at places (n, 2) px."""
+    logits = _at(id_logits, xy)
+    logits = logits - logits.max(axis=1, keepdims=True)
+    return np.asarray(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
 
 
 def keypoint_probability(detector_logits: Float32) -> Float32:
@@ -125,58 +137,69 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
-def open_session(model: bytes, threads: int = 0) -> Any:
-    """An ``onnxruntime.InferenceSession`` on the processor; 0 threads leaves their number to it."""
+class Session(Protocol):
+    """What runs a network: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
+
+    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
+        """All outputs for an input by name."""
+        ...
+
+
+class OpenVinoSession:
+    """A network compiled by OpenVINO for the processor."""
+
+    def __init__(self, model: bytes, threads: int) -> None:
+        import openvino
+
+        settings = {"INFERENCE_NUM_THREADS": threads} if threads else {}
+        self._compiled = openvino.Core().compile_model(io.BytesIO(model), "CPU", settings)
+
+    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
+        """All outputs for an input by name."""
+        results = self._compiled(feed)
+        return [np.array(results[output]) for output in self._compiled.outputs]
+
+
+RUNTIMES = ("auto", "cpu", "cuda", "openvino")
+
+
+def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
+    """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
+
+    The environment variable ``KPBENCH_RUNTIME`` chooses: "auto" (ONNX Runtime, on CUDA where the installed
+    package has it), "cpu", "cuda", or "openvino". 0 threads leaves their number to the runtime.
+
+    Raises
+    ------
+    DataError
+        If that runtime is not there.
+    """
     import onnxruntime
 
+    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
+    if asked not in RUNTIMES:
+        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    if asked == "cuda" and not has_cuda:
+        raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
+    providers = ["CPUExecutionProvider"]
+    if has_cuda and asked in ("auto", "cuda"):
+        providers.insert(0, "CUDAExecutionProvider")
+    session = onnxruntime.InferenceSession(model, options, providers=providers)
+    content = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
+    if asked != "openvino":
+        return session, content
+    try:
+        return OpenVinoSession(model, threads), content
+    except ModuleNotFoundError:
+        raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
 
 
-LEAST_FIT = 0.8
-"""Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
-
-
-def fit_designs(grey: UInt8, found: Detections, patches: Sequence[Patch]) -> Detections:
-    """Move each detection to the centre of its design, fitted to the pixels around it.
-
-    Where the design does not fit (:data:`LEAST_FIT`), or its centre is further off than a network errs
-    (3 px, or a quarter of the patch's short semi-axis), the detection stays where it was.
-
-    Parameters
-    ----------
-    grey : ndarray of shape (H, W), uint8
-    found : Detections
-        With ``patch_id``; scores and identities are not changed.
-    patches : sequence of Patch
-    """
-    if found.patch_id is None or min(grey.shape) < 2 * CELL:
-        return found
-    patches = [patch for patch in patches if patch.patch_id in found.patch_id]
-    if not patches:
-        return found
-    known = match.bank(patches)
-    raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
-    octaves = min(4, len(smooth))
-    level = np.tile(np.arange(octaves), len(found))
-    poses = match.search(smooth, np.repeat(found.xy, octaves, axis=0), level, known, margin=2.0)
-    designs = len(patches)  # a margin of 2 keeps a pose of every design at every place and octave
-    owner = np.repeat(np.arange(len(found)), octaves * designs)
-    ids = np.array([patch.patch_id for patch in patches])
-    own = ids[poses.which] == found.patch_id[owner]
-    poses, owner = poses[own], owner[own]
-    poses = match.align(smooth, poses, known.core, 3, 0.9 * match.RING_PX)
-    order = np.lexsort((-poses.ncc, owner))
-    owner, first = np.unique(owner[order], return_index=True)
-    whole = match.align(smooth, match.extend(smooth, poses[order[first]], known), known.whole, 4, 5.6)
-    fit = refine.fit(raw, whole.xy, whole.A, [patches[n] for n in whole.which])
-    moved = np.linalg.norm(fit.xy - found.xy[owner], axis=1)
-    good = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.25 * match.short_axis(fit.A)))
-    xy = found.xy.copy()
-    xy[owner[good]] = fit.xy[good]
-    return Detections(xy, found.score, found.patch_id)
+CANDIDATE = 0.08
+"""Least score of the network from which a place is worth verifying."""
 
 
 @dataclass
@@ -187,9 +210,11 @@ class SuperPointDetector:
     ----------
     path : Path, optional
         ONNX file written by ``kpbench export-model``; None: the weights that ship with kpbench.
-    decoding : Decoding
-    patches : sequence of Patch, optional
-        The designs: each detection is then fitted to its design, see :func:`fit_designs`. None: it is not.
+    threshold : float
+        Least score of a detection, in [0, 1].
+    verified : bool
+        Whether the network's candidates are compared with the designs, which the file holds
+        (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides.
     threads : int
         Threads of ONNX Runtime; 0 leaves the choice to it.
 
@@ -200,37 +225,68 @@ class SuperPointDetector:
     """
 
     path: Path | None = None
-    decoding: Decoding = field(default_factory=Decoding)
-    patches: Sequence[Patch] | None = field(default_factory=shipped_patches)
+    threshold: float = 0.5
+    verified: bool = True
     threads: int = 0
     shipped: ClassVar[str] = "superpoint.onnx"
 
     def __post_init__(self) -> None:
         self.path = Path(__file__).parent.parent / "weights" / self.shipped if self.path is None else Path(self.path)
         try:
-            self._session = open_session(self.path.read_bytes(), self.threads)
-            content = json.loads(self._session.get_modelmeta().custom_metadata_map.get("kpbench", "{}"))
+            self._session, text = open_session(self.path.read_bytes(), self.threads)
+            content = json.loads(text or "{}")
+        except DataError:
+            raise
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
             raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
         if content.get("schema") != SCHEMA:
             raise DataError(f"{self.path}: not written by kpbench export-model, expected schema {SCHEMA!r} inside")
         self.content: dict[str, Any] = content
         self.name, self.version = str(content["name"]), f"{content['designs'][:8]}-{content['samples']}"
-        self._patch_ids = np.array([p["id"] for p in content["patches"]], np.int64)
+        self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
+        self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
-        grey = to_grey(image)
-        blob = np.float32(1 / 255) * pad_to_cells(grey)[None, None]
-        detector, ids = self._session.run(None, {"image": blob})
-        found = decode(detector[0], ids[0], self.decoding)
-        height, width = grey.shape
-        inside = np.all((found.xy > -0.5) & (found.xy < (width - 0.5, height - 0.5)), axis=1)
-        found = found[inside]
-        found = Detections(found.xy, found.score, self._patch_ids[found.patch_id])
-        return found if self.patches is None else fit_designs(grey, found, self.patches)
+        return self.batch([image])[0]
 
     detect = __call__
+
+    def batch(self, images: Sequence[UInt8]) -> list[Detections]:
+        """Detections of several images of one size, which pass the network in one call.
+
+        Raises
+        ------
+        DataError
+            If one is no image, or they differ in size.
+        """
+        greys = [to_grey(image) for image in images]
+        if not greys or not greys[0].size:
+            return [Detections.none() for _ in greys]
+        return [self._decoded(*parts) for parts in zip(greys, *self.heads(greys), strict=True)]
+
+    def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
+        """The two raw heads of several grey images of one size: (B, 65, h, w) and (B, ids + 1, h, w)."""
+        if len({grey.shape for grey in greys}) > 1:
+            raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
+        blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
+        return self._session.run(None, {"image": blob})
+
+    def _decoded(self, grey: UInt8, detector: Float32, ids: Float32) -> Detections:
+        how = Decoding(CANDIDATE if self.verified else self.threshold)
+        xy, score = locate(detector, how)
+        height, width = grey.shape
+        inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
+        xy, score = xy[inside], score[inside]
+        log_id = identify(ids, xy)
+        if not self.verified or not len(xy) or min(grey.shape) < 2 * CELL:
+            return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
+        found = verify.examine(grey, xy, score, log_id, self.patches)
+        score = verify.score(found)
+        sure = np.flatnonzero(score >= self.threshold)
+        # discs do not overlap: of two centres within one disc the likelier stays
+        kept = sure[suppress(found.xy[sure], score[sure], np.maximum(how.separation_px, 0.6 * found.minor_px[sure]))]
+        return Detections(found.xy[kept], score[kept], self._patch_ids[found.which[kept]])
 
 
 @dataclass

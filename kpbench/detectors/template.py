@@ -75,7 +75,7 @@ def crossings(level: Float32) -> tuple[Float, Float]:
 
 
 CORE, LIKENESS, MOST = 0.89, 11.7, 80
-"""Least correlation of a candidate near its centre, least :func:`_likeness`, most candidates of 640x480 px."""
+"""Least correlation of a candidate near its centre, least likeness, most candidates of 640x480 px."""
 
 
 @dataclass(frozen=True)
@@ -110,18 +110,13 @@ class Candidates:
         relative_blur = np.minimum(self.fit.blur_px / np.maximum(match.short_axis(self.fit.A), 0.5), 1)
         evidence = (
             -12.55
-            + _likeness(self.core, self.whole)
+            + match.likeness(self.core, self.whole)
             - 0.78 * np.log(np.minimum(unexplained, 3) + 0.02)
             - 16.64 * relative_blur
             + 2.46 * np.log(contrast / (self.range + 5))
         )
         sane = (self.fit.white > self.fit.black) & np.isfinite(evidence)
         return np.where(sane, 1 / (1 + np.exp(-np.clip(evidence, -30, 30))), 0.0)
-
-
-def _likeness(core: Float, whole: Float) -> Float:
-    """What the two correlations are worth, in units of log odds."""
-    return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
 
 
 @dataclass(frozen=True)
@@ -175,11 +170,11 @@ class TemplateDetector:
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
         whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
-        sure = _likeness(core.ncc, whole.ncc) > LIKENESS
+        sure = match.likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
         dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-        return Candidates(whole.which, core.ncc, whole.ncc, fit, _noise(raw[0]), float(bright - dark))
+        return Candidates(whole.which, core.ncc, whole.ncc, fit, match.noise(raw[0]), float(bright - dark))
 
 
 def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
@@ -189,12 +184,6 @@ def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
     return np.concatenate([points * 2**n for n, points in enumerate(xy)]), np.repeat(
         np.arange(len(xy)), [len(points) for points in xy]
     )
-
-
-def _noise(image: Float32) -> float:
-    """Standard deviation of noise from the median of second differences, which edges hardly move."""
-    kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
-    return 1.4826 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
 
 
 def _distinct(poses: match.Poses) -> Ints:

@@ -1,0 +1,70 @@
+"""How long the whole detect step takes, against PyTorch eager float32 of the plain SuperPoint.
+
+    python benchmarks/detect.py DATASET [--images 20] [--superpoint FILE.onnx]
+
+For each detector: the network alone, what follows it (decoding, and verification by the designs), and both, for one
+image at a time, medians over the images; then images a second. The rival is SuperPoint's network of the paper's
+size (64-64-128-128, 256) with random weights in PyTorch, the network alone: its decoding is not counted.
+Runs are interleaved, so that a machine that slows down slows all. `--superpoint` times a full-size model too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+import kpbench
+from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
+from kpbench.network import SuperPoint
+from kpbench.recipe import NetworkConfig
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("dataset")
+    parser.add_argument("--images", type=int, default=20)
+    parser.add_argument("--superpoint")
+    options = parser.parse_args()
+    dataset = kpbench.open_dataset(options.dataset)
+    images = [dataset.image(n) for n in range(min(options.images, len(dataset)))]
+    detectors = {"superpoint-small": SmallSuperPointDetector()}
+    if options.superpoint:
+        detectors["superpoint"] = SuperPointDetector(options.superpoint)
+    torch.set_num_threads(kpbench.workers.cores())
+    rival = SuperPoint(NetworkConfig()).eval()
+    steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}
+    for name, detector in detectors.items():
+        steps[f"{name}: network"] = lambda image, d=detector: d.heads([image])
+        steps[f"{name}: whole"] = detector
+    seconds: dict[str, list[float]] = {name: [] for name in steps}
+    for step in steps.values():
+        step(images[0])
+    for image in images:
+        for name, step in steps.items():
+            began = time.perf_counter()
+            step(image)
+            seconds[name].append(time.perf_counter() - began)
+    floor = np.median(seconds["PyTorch eager"])
+    height, width = images[0].shape[:2]
+    print(f"{width}x{height}, {len(images)} images, medians")
+    for name, times in seconds.items():
+        median = np.median(times)
+        print(f"{name:28} {1e3 * median:8.1f} ms {1 / median:7.1f} images/s {floor / median:6.1f} x")
+    for name in detectors:
+        after = np.median(np.subtract(seconds[f"{name}: whole"], seconds[f"{name}: network"]))
+        print(f"{name}: after the network {after / np.median(seconds[f'{name}: network']):.0%} of its time")
+
+
+@torch.inference_mode()
+def _torch(network: SuperPoint, image: np.ndarray) -> object:
+    grey = image if image.ndim == 2 else image.mean(axis=2)
+    height, width = (side // 8 * 8 for side in grey.shape)
+    return network(torch.from_numpy(grey[:height, :width].astype(np.float32) / 255)[None, None])
+
+
+if __name__ == "__main__":
+    main()

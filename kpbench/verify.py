@@ -1,0 +1,134 @@
+"""Verification: what the pixels say of the points that a network found.
+
+A network says where it sees a keypoint and which design it takes it for. Here all designs are laid over each
+such place (:mod:`kpbench.match`), the likeliest is fitted to the pixels (:mod:`kpbench.refine`), and both kinds of
+evidence together give the identity, the centre, and the probability that there is a patch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench import match, refine
+from kpbench.design import Patch
+from kpbench.keypoints import Float, UInt8
+
+__all__ = ["EVIDENCE", "Examined", "examine", "score"]
+
+EVIDENCE = (
+    "log odds of the network's score",
+    "log probability that the ID head sees a patch",
+    "likeness of the coarse match",
+    "-log(1.01 - correlation of the fit)",
+    "log of what the fit leaves unexplained, in contrasts",
+    "blur in short semi-axes",
+    "log of contrast over the range of the image",
+    "log of the distance from the network's place, in short semi-axes",
+    "log of contrast over noise",
+    "log of the short semi-axis, px",
+)
+"""The columns of :attr:`Examined.evidence`."""
+
+WEIGHTS = np.array([0.373, 29.1, 0.172, 0.831, -0.748, -5.4, 0.18, -0.291, -0.253, -0.0116])
+BIAS = -4.18
+"""Logistic regression: `benchmarks/verification.py` fits it to synthetic images from training photographs."""
+
+LIKENESS_IN_ID = 0.3
+"""What a unit of likeness weighs against a unit of the ID head's log probability when the design is chosen."""
+HOPELESS = -3.5
+"""Log odds, by what is known before the fit, under which a place is not worth a fit."""
+LEAST_FIT = 0.7
+"""Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
+
+
+@dataclass(frozen=True)
+class Examined:
+    """What is known of the n places that were worth a fit.
+
+    Attributes
+    ----------
+    place : (n,) index of the place that was asked about.
+    which : (n,) index of the likeliest design.
+    xy : (n, 2) px, the fitted centre, or the place itself where the fit is not to be trusted.
+    minor_px : (n,) short semi-axis of the fitted disc.
+    evidence : (n, len(EVIDENCE))
+    """
+
+    place: NDArray[np.int64]
+    which: NDArray[np.int64]
+    xy: Float
+    minor_px: Float
+    evidence: Float
+
+
+def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Examined:
+    """Compare places with all designs, and fit the likeliest.
+
+    Parameters
+    ----------
+    grey : ndarray of shape (H, W), uint8
+    xy : ndarray of shape (n, 2), px
+    network_score : ndarray of shape (n,), in [0, 1]
+    log_id : ndarray of shape (n, len(patches) + 1): log-probability of each design, and of none.
+    patches : the designs.
+    """
+    log_odds = _log_odds(network_score)
+    patch_seen = np.log(np.maximum(1 - np.exp(log_id[:, -1]), 1e-4))
+    known = match.bank(patches)
+    raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
+    core = match.align(smooth, _start(smooth, xy, known), known.core, 3, 0.9 * match.RING_PX)
+    whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
+    likeness = match.likeness(core.ncc, whole.ncc).reshape(len(xy), len(patches))
+    which = np.argmax(log_id[:, :-1] + LIKENESS_IN_ID * likeness, axis=1)
+    likeness = np.take_along_axis(likeness, which[:, None], axis=1)[:, 0]
+    hope = -3.1 + 0.57 * log_odds + 12.3 * patch_seen + 0.24 * likeness
+    place = np.flatnonzero(hope > HOPELESS)
+    which, likeness, log_odds, patch_seen = which[place], likeness[place], log_odds[place], patch_seen[place]
+    whole = whole[place * len(patches) + which]
+    fit = refine.fit(raw, whole.xy, whole.A, [patches[n] for n in which])
+
+    minor = np.maximum(match.short_axis(fit.A), 0.5)
+    contrast, noise = np.maximum(fit.white - fit.black, 1.0), match.noise(raw[0])
+    moved = np.linalg.norm(fit.xy - xy[place], axis=1)
+    dark, bright = np.percentile(grey[::4, ::4], (2, 98))
+    unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - noise**2, 0)) / contrast, 3.0)
+    evidence = np.column_stack(
+        [
+            log_odds,
+            patch_seen,
+            likeness,
+            -np.log(1.01 - fit.ncc),
+            np.log(unexplained + 0.02),
+            np.minimum(fit.blur_px / minor, 1.0),
+            np.log(contrast / (bright - dark + 5)),
+            np.log(moved / minor + 0.02),
+            np.log(contrast / (noise + 1)),
+            np.log(minor),
+        ]
+    )
+    trusted = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.35 * minor))
+    centres = np.where(trusted[:, None], fit.xy, xy[place])
+    return Examined(place, which, centres, minor, np.nan_to_num(evidence))
+
+
+def _start(levels: Sequence[NDArray[np.float32]], xy: Float, known: match.Bank) -> match.Poses:
+    """The best pose of every design at every place, (n * designs), over four octaves."""
+    octaves, designs = min(4, len(levels)), len(known.patches)
+    level = np.repeat(np.arange(octaves), len(xy))
+    poses = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=2.0)  # all designs at each
+    best = poses.ncc.reshape(octaves, -1).argmax(axis=0)
+    return poses[best * len(xy) * designs + np.arange(len(xy) * designs)]
+
+
+def score(found: Examined) -> Float:
+    """Probability (n,) that there is a patch, and that its centre and design are right."""
+    return np.asarray(1 / (1 + np.exp(-np.clip(found.evidence @ WEIGHTS + BIAS, -30, 30))))
+
+
+def _log_odds(probability: Float) -> Float:
+    clipped = np.clip(probability, 1e-3, 1 - 1e-3)
+    return np.asarray(np.log(clipped / (1 - clipped)))

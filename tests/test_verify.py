@@ -1,0 +1,58 @@
+import numpy as np
+import pytest
+
+from kpbench import verify
+from kpbench.design import shipped_patches
+from kpbench.scene import Placement, render_scene
+
+PATCHES = shipped_patches()
+SURE = 0.9
+
+
+def scene():
+    """Two patches on an even ground: image, centres, indices of their designs."""
+    placements = [
+        Placement(PATCHES[1], np.array([[12.0, 2.0, 40.3], [-1.0, 9.0, 30.8], [0.0, 0.001, 1.0]]), 20.0, 230.0),
+        Placement(PATCHES[3], np.array([[0.0, -30.0, 110.6], [30.0, 0.0, 70.1], [0.0005, 0.0, 1.0]]), 40.0, 200.0),
+    ]
+    rendered = render_scene(np.full((128, 160), 120, np.uint8), placements)
+    return rendered.image, np.column_stack([rendered.keypoints["x"], rendered.keypoints["y"]]), [1, 3]
+
+
+def examined(image, xy, said, sure=SURE):
+    """What is made of places at which a network sees these designs, with this probability."""
+    log_id = np.log(np.full((len(xy), len(PATCHES) + 1), (1 - sure) / len(PATCHES)))
+    log_id[np.arange(len(xy)), said] = np.log(sure)
+    return verify.examine(image, np.asarray(xy, float), np.full(len(xy), sure), log_id, PATCHES)
+
+
+def test_the_fit_finds_the_centre_to_a_fiftieth_of_a_pixel():
+    image, xy, which = scene()
+    found = examined(image, np.add(xy, [[0.9, -0.8], [-1.0, 1.2]]), which)
+    np.testing.assert_allclose(found.xy, xy, atol=0.02)
+    assert found.which.tolist() == which
+    assert np.all(verify.score(found) > 0.9)
+
+
+@pytest.mark.parametrize("said", range(4))
+def test_the_pixels_outvote_a_network_that_is_not_sure_of_the_design(said):
+    image, xy, which = scene()
+    assert examined(image, xy, [said, said], sure=0.4).which.tolist() == which
+
+
+def test_what_is_no_patch_scores_low_and_stays_where_it_was():
+    image, xy, which = scene()
+    places = [[20.0, 100.0], [xy[0, 0] + 8, xy[0, 1]]]  # bare ground; 8 px beside a centre
+    found = examined(image, places, which)
+    assert np.all(verify.score(found) < 0.5)
+    np.testing.assert_array_equal(found.xy, np.array(places)[found.place])
+
+
+def test_hopeless_places_are_not_fitted():
+    image, _, _ = scene()
+    assert len(examined(image, [[20.0, 100.0]], [0], sure=0.01).place) == 0
+
+
+def test_evidence_has_a_column_for_each_name():
+    image, xy, which = scene()
+    assert examined(image, xy, which).evidence.shape == (2, len(verify.EVIDENCE)) == (2, len(verify.WEIGHTS))
