@@ -39,8 +39,12 @@ BIAS = -4.18
 
 LIKENESS_IN_ID = 0.3
 """What a unit of likeness weighs against a unit of the ID head's log probability when the design is chosen."""
-HOPELESS = -3.5
-"""Log odds, by what is known before the fit, under which a place is not worth a fit."""
+HOPE, HOPELESS = np.array([0.57, 12.3, 0.24]), -0.4
+"""What the first three of the evidence weigh before the fit, and the sum under which a place is not worth one."""
+FAINTEST = 2.0
+"""Grey levels between the inks under which nothing that is fitted means anything."""
+OCTAVES = 2
+"""Best octaves by the coarse search of which each is aligned before one is chosen."""
 LEAST_FIT = 0.7
 """Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
 
@@ -76,31 +80,35 @@ def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches
     log_id : ndarray of shape (n, len(patches) + 1): log-probability of each design, and of none.
     patches : the designs.
     """
-    log_odds = _log_odds(network_score)
-    patch_seen = np.log(np.maximum(1 - np.exp(log_id[:, -1]), 1e-4))
     known = match.bank(patches)
     raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
-    core = match.align(smooth, _start(smooth, xy, known), known.core, 3, 0.9 * match.RING_PX)
+    core = _core(smooth, xy, known)
     whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
     likeness = match.likeness(core.ncc, whole.ncc).reshape(len(xy), len(patches))
     which = np.argmax(log_id[:, :-1] + LIKENESS_IN_ID * likeness, axis=1)
-    likeness = np.take_along_axis(likeness, which[:, None], axis=1)[:, 0]
-    hope = -3.1 + 0.57 * log_odds + 12.3 * patch_seen + 0.24 * likeness
-    place = np.flatnonzero(hope > HOPELESS)
-    which, likeness, log_odds, patch_seen = which[place], likeness[place], log_odds[place], patch_seen[place]
-    whole = whole[place * len(patches) + which]
-    fit = refine.fit(raw, whole.xy, whole.A, [patches[n] for n in which])
+    patch_seen = np.log(np.maximum(1 - np.exp(log_id[:, -1]), 1e-4))
+    before = np.column_stack([_log_odds(network_score), patch_seen, likeness[np.arange(len(xy)), which]])
+    place = np.flatnonzero(before @ HOPE > HOPELESS)
 
+    poses = whole[place * len(patches) + which[place]]
+    fit = refine.fit(raw, poses.xy, poses.A, [patches[n] for n in poses.which])
+    seen = np.flatnonzero(fit.white - fit.black > FAINTEST)
+    place, fit = place[seen], fit[seen]
     minor = np.maximum(match.short_axis(fit.A), 0.5)
-    contrast, noise = np.maximum(fit.white - fit.black, 1.0), match.noise(raw[0])
     moved = np.linalg.norm(fit.xy - xy[place], axis=1)
+    trusted = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.35 * minor))
+    centres = np.where(trusted[:, None], fit.xy, xy[place])
+    evidence = np.column_stack([before[place], _evidence(grey, raw[0], fit, minor, moved)])
+    return Examined(place, which[place], centres, minor, np.nan_to_num(evidence))
+
+
+def _evidence(grey: UInt8, image: NDArray[np.float32], fit: refine.Fit, minor: Float, moved: Float) -> Float:
+    """The columns of :data:`EVIDENCE` that come from the fit."""
+    contrast, noise = fit.white - fit.black, match.noise(image)
     dark, bright = np.percentile(grey[::4, ::4], (2, 98))
     unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - noise**2, 0)) / contrast, 3.0)
-    evidence = np.column_stack(
+    return np.column_stack(
         [
-            log_odds,
-            patch_seen,
-            likeness,
             -np.log(1.01 - fit.ncc),
             np.log(unexplained + 0.02),
             np.minimum(fit.blur_px / minor, 1.0),
@@ -110,18 +118,17 @@ def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches
             np.log(minor),
         ]
     )
-    trusted = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.35 * minor))
-    centres = np.where(trusted[:, None], fit.xy, xy[place])
-    return Examined(place, which, centres, minor, np.nan_to_num(evidence))
 
 
-def _start(levels: Sequence[NDArray[np.float32]], xy: Float, known: match.Bank) -> match.Poses:
-    """The best pose of every design at every place, (n * designs), over four octaves."""
-    octaves, designs = min(4, len(levels)), len(known.patches)
+def _core(levels: Sequence[NDArray[np.float32]], xy: Float, known: match.Bank) -> match.Poses:
+    """The best pose of every design's core at every place, (n * designs), over four octaves."""
+    octaves, count = min(4, len(levels)), len(xy) * len(known.patches)
     level = np.repeat(np.arange(octaves), len(xy))
     poses = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=2.0)  # all designs at each
-    best = poses.ncc.reshape(octaves, -1).argmax(axis=0)
-    return poses[best * len(xy) * designs + np.arange(len(xy) * designs)]
+    likeliest = np.argsort(-poses.ncc.reshape(octaves, count), axis=0, kind="stable")[:OCTAVES]
+    poses = poses[(likeliest * count + np.arange(count)).ravel()]
+    poses = match.align(levels, poses, known.core, 3, 0.9 * match.RING_PX)
+    return poses[poses.ncc.reshape(-1, count).argmax(axis=0) * count + np.arange(count)]
 
 
 def score(found: Examined) -> Float:

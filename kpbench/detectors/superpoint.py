@@ -152,7 +152,8 @@ class OpenVinoSession:
         import openvino
 
         settings = {"INFERENCE_NUM_THREADS": threads} if threads else {}
-        self._compiled = openvino.Core().compile_model(io.BytesIO(model), "CPU", settings)
+        core = openvino.Core()
+        self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
         """All outputs for an input by name."""
