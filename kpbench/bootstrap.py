@@ -21,7 +21,7 @@ __all__ = ["Interval", "by_scene", "intervals"]
 
 Int = NDArray[np.int64]
 Interval = tuple[float, float]
-MOST_KINDS = 4000  # different scenes that a bootstrap tells apart
+MOST_KINDS = 1000  # different scenes that a bootstrap tells apart
 
 
 def by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
@@ -82,6 +82,6 @@ def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:
     sizes = (table.max(axis=0) - least).astype(object) + 1
     if np.prod(sizes) >= 2**62:
         return np.unique(table, axis=0, return_counts=True)
-    code = np.ravel_multi_index(tuple((table - least).T), tuple(int(size) for size in sizes))
-    _, first, many = np.unique(code, return_index=True, return_counts=True)
-    return table[first], many
+    shape = tuple(int(size) for size in sizes)
+    code, many = np.unique(np.ravel_multi_index(tuple((table - least).T), shape), return_counts=True)
+    return np.stack(np.unravel_index(code, shape), axis=1) + least, many

@@ -126,16 +126,21 @@ def ratios(sums: NDArray[Any], matching: str) -> dict[str, Float]:
 
 
 def precision_recall(score: Float, hit: NDArray[np.bool_], truths: int) -> tuple[float | None, Float, Float, Float]:
-    """Average precision, and (thresholds, matches, detections) above each, from scores that fall or stay.
+    """Average precision, and (thresholds, matches, detections) above each, from the surest detection on.
+
+    ``score`` and ``hit`` (whether it is a match) are of shape (D,), in any order.
 
     A threshold cannot split equal scores, so their order among each other does not matter.
     The assignment prefers high scores, so cutting detections off below a threshold leaves the number of matches above
     it as it is: one matching serves all thresholds.
     """
-    last = np.flatnonzero(np.append(np.diff(score) != 0, True)[: len(score)])
-    matched, kept = np.cumsum(hit)[last].astype(np.float64), (last + 1).astype(np.float64)
+    every, hits = np.sort(score), np.sort(score[hit])  # sorting values is several times faster than sorting indices
+    first = np.flatnonzero(np.append(True, np.diff(every) != 0)[: len(every)])[::-1]
+    level = every[first]
+    kept = (len(every) - first).astype(np.float64)
+    matched = (len(hits) - np.searchsorted(hits, level[::-1], side="left")[::-1]).astype(np.float64)
     area = float(np.sum(np.diff(matched, prepend=0.0) / truths * matched / kept)) if truths else None
-    return area, score[last], matched, kept
+    return area, level, matched, kept
 
 
 def error_metrics(distance: Float, radius: Float) -> dict[str, float | None]:
