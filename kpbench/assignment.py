@@ -6,6 +6,7 @@ never decide, and the order of images, keypoints and detections changes nothing.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 
 from kpbench.keypoints import Float
 
-__all__ = ["CLUTTER", "DUPLICATE", "MATCHED", "NEAR_MISS", "Matches", "match"]
+__all__ = ["CLUTTER", "DUPLICATE", "MATCHED", "NEAR_MISS", "Matches", "match", "matched_within"]
 
 Int = NDArray[np.int64]
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
@@ -86,16 +87,13 @@ def match(
     t, d, distance = t[inside], d[inside], distance[inside]
     kind[d] = DUPLICATE
 
-    # Nearly all pairs are alone: nobody else wants either of the two
-    shared = np.bincount(d, minlength=len(xy))[d] > 1
-    alone = (np.bincount(t, minlength=len(truth_xy))[t] == 1) & ~shared
-    contested = np.flatnonzero(~alone)
-    won = contested[_resolve(t[contested], d[contested], distance[contested], truth_xy, xy, score)]
+    contested = _contested(t, d)
     detection, gap = np.full(len(truth_xy), -1), np.full(len(truth_xy), np.nan)
-    for rows in (alone, won):
-        detection[t[rows]], gap[t[rows]] = d[rows], distance[rows]
+    won = _explain(t, d, distance, contested, truth_xy, xy, score)
+    detection[t[won]], gap[t[won]] = d[won], distance[won]
     kind[detection[detection >= 0]] = MATCHED
 
+    shared = np.bincount(d, minlength=len(xy))[d] > 1
     nearest = np.full(len(xy), -1)
     nearest[d[~shared]] = t[~shared]
     torn = np.flatnonzero(shared)
@@ -109,6 +107,33 @@ def match(
         twin = (score[d] == score[detection[t]]) & (xy[d] == xy[detection[t]]).all(axis=1)
         contradicted[t[twin & (patch_id[d] != patch_id[detection[t]])]] = True
     return Matches(detection, gap, contradicted, nearest, kind)
+
+
+def matched_within(
+    truth_xy: Float, truth_image: Int, radius: Float, eps: Sequence[float], xy: Float, score: Float, image: Int
+) -> list[int]:
+    """How many keypoints are matched at each ``eps``; parameters are those of :func:`match`."""
+    t, d, distance = _pairs_within(truth_xy, truth_image, max(eps) * radius, xy, image)
+    counts = []
+    for value in eps:
+        near = distance <= value * radius[t]
+        pairs = t[near], d[near], distance[near]
+        counts.append(len(_explain(*pairs, _contested(*pairs[:2]), truth_xy, xy, score)))
+    return counts
+
+
+def _contested(t: Int, d: Int) -> NDArray[np.bool_]:
+    """Which pairs share a keypoint or a detection with another; nearly none do."""
+    return (np.bincount(t)[t] > 1) | (np.bincount(d)[d] > 1) if len(t) else np.zeros(0, bool)
+
+
+def _explain(
+    t: Int, d: Int, distance: Float, contested: NDArray[np.bool_], truth_xy: Float, xy: Float, score: Float
+) -> Int:
+    """Rows of the pairs that are matches."""
+    rows = np.flatnonzero(contested)
+    won = _resolve(t[rows], d[rows], distance[rows], truth_xy, xy, score)
+    return np.concatenate([np.flatnonzero(~contested), rows[won]])
 
 
 def _pairs_within(truth_xy: Float, truth_image: Int, reach: Float, xy: Float, image: Int) -> tuple[Int, Int, Float]:

@@ -21,6 +21,7 @@ __all__ = [
     "confusion_table",
     "count_table",
     "difference_table",
+    "eps_chart",
     "estimate",
     "group_table",
     "overview_table",
@@ -272,6 +273,18 @@ def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
         series, "recall", "precision", y_range=(0.0, 1.0), x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1), markers=False
     )
     return Figure("Precision and recall over all thresholds", svg, tuple((s.name, s.style) for s in series))
+
+
+def eps_chart(runs: Sequence[Scores]) -> Figure:
+    """Detection score over the reach of a match; the one that was used is not special here."""
+    series = [
+        Series(run.name, [e or 0.0 for e in run.eps_curve["eps"]], run.eps_curve["detection_score"], style=n)
+        for n, run in enumerate(runs)
+    ]
+    label = f"ε, in radii ({runs[0].settings.eps_radius})"
+    ticks = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
+    svg = line_chart(series, label, LABELS["detection_score"], y_range=(0.0, 1.0), x_ticks=ticks, log_x=True)
+    return Figure("Detection score over ε", svg, tuple((s.name, s.style) for s in series))
 
 
 def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:

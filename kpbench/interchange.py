@@ -92,7 +92,7 @@ def _coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         name = f"{ids[n]:08d}.png"
         write_atomic(folder / "images" / name, _png(image))
         height, width = image.shape[:2]
-        images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height})
+        images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height, **_origin(dataset, n)})
         for k, box in zip(keypoints, _boxes(keypoints, width, height), strict=True):
             annotations.append(
                 {
@@ -117,6 +117,13 @@ def _coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
     write_atomic(folder / "annotations.json", json.dumps(content).encode())
     return folder / "annotations.json"
+
+
+def _origin(dataset: Dataset, n: int) -> dict[str, Any]:
+    """What ``kpbench score`` groups an image by."""
+    truth = dataset.truth
+    known = {"condition": str(truth.condition[n]), "rung": float(truth.rung[n])} if truth.condition[n] else {}
+    return {**known, "scene_id": int(truth.scene_id[n])}
 
 
 def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:

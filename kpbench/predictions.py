@@ -13,13 +13,14 @@ import importlib
 import io
 import json
 import math
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
 import orjson
@@ -34,6 +35,7 @@ SCHEMA = "kpbench.predictions/1"
 HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 RECORD_KEYS = {"image_id", "keypoints", "scores", "ids"}
 COLUMNS = ("image_id", "x", "y", "score", "id")
+PIECE_BYTES = 16 * 2**20  # of JSON that is decoded at a time
 
 Int = NDArray[np.int64]
 
@@ -197,21 +199,66 @@ def read_predictions(path: str | Path) -> Predictions:
 
 
 def _read_json(path: Path) -> Predictions:
-    content = _parse(path.read_bytes(), "the file")
+    data = path.read_bytes()
+    try:
+        header, pieces = _pieces(data)
+        return _from_batches(map(orjson.loads, pieces), _header(header), lambda n: f"predictions[{n}]")
+    except orjson.JSONDecodeError:  # not of the shape that can be cut: read it whole, which also says what is wrong
+        content = _parse(data, "the file")
+    if isinstance(content, list):
+        return coco_results(content)
     if not isinstance(content, dict):
         raise PredictionsError(f"holds {_kind(content)}, expected an object with schema {SCHEMA!r}")
     records = content.pop("predictions", None)
     header = _header(content)
     if not isinstance(records, list):
         raise PredictionsError(f"predictions is {_kind(records)}, expected a list")
-    return _from_records(records, header, lambda n: f"predictions[{n}]")
+    return _from_batches([records], header, lambda n: f"predictions[{n}]")
+
+
+def _pieces(data: bytes) -> tuple[dict[str, Any], Iterator[bytes]]:
+    """A large file's header, and its list of predictions cut into shorter lists.
+
+    Decoded at once, the list would take five times its file in memory. No record holds an object, so each ends
+    with the next brace; and lists that decode one by one are the list that they were cut from.
+
+    Raises
+    ------
+    orjson.JSONDecodeError
+        If the file is none that can be cut like this.
+    """
+    opening = re.search(rb'"predictions"\s*:\s*\[', data)
+    start, stop = (opening.end(), data.rfind(b"]")) if opening else (0, 0)
+    header = orjson.loads(data[:start] + data[stop:])
+    if not isinstance(header, dict) or header.pop("predictions", None) != []:
+        raise orjson.JSONDecodeError("not to be cut", "", 0)
+
+    def cut() -> Iterator[bytes]:
+        low, more = start, False
+        while low < stop or more:
+            high = data.find(b"}", low + PIECE_BYTES, stop) + 1 or stop
+            piece = data[low:high]
+            if more and not piece.strip():
+                raise orjson.JSONDecodeError("nothing after a comma", "", low)
+            yield b"[%s]" % piece
+            comma = data.find(b",", high, stop)
+            more, low = comma >= 0, comma + 1 if comma >= 0 else stop
+            if data[high : comma if more else stop].strip():
+                raise orjson.JSONDecodeError("no comma after a record", "", high)
+
+    return header, cut()
 
 
 def _read_jsonl(path: Path) -> Predictions:
+    def batches(file: BinaryIO) -> Iterator[list[Any]]:
+        first = 2
+        while lines := file.readlines(PIECE_BYTES):
+            yield [_parse(line, f"line {n}") for n, line in enumerate(lines, first)]
+            first += len(lines)
+
     with path.open("rb") as file:
         header = _header(_parse(file.readline(), "line 1"))
-        records = [_parse(line, f"line {n}") for n, line in enumerate(file, 2)]
-    return _from_records(records, header, lambda n: f"line {n + 2}")
+        return _from_batches(batches(file), header, lambda n: f"line {n + 2}")
 
 
 @contextmanager
@@ -255,8 +302,52 @@ def _header(content: Any) -> dict[str, Any]:
     return {"detector": detector, "dataset": dataset, "fingerprint": fingerprint}
 
 
-def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
-    """Columns from one object an image.
+class _Batch(NamedTuple):
+    """Some records as columns; scores and ids are None where no record has any."""
+
+    image_id: list[int]
+    counts: Int
+    xy: Float
+    score: Float | None
+    patch_id: Int | None
+
+
+def _from_batches(batches: Iterable[list[Any]], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
+    """Columns from lists of objects, one object an image; ``place`` names the n-th of all."""
+    parts: list[_Batch] = []
+    start = 0
+    for records in batches:
+        parts.append(_batch(records, start, place))
+        start += len(records)
+    filled = [part for part in parts if len(part.xy)]
+    for name in ("score", "patch_id"):
+        bare = [getattr(part, name) is None for part in filled]
+        if any(bare) and not all(bare):
+            lacking = filled[bare.index(True)]
+            n = sum(len(part.image_id) for part in parts[: next(k for k, p in enumerate(parts) if p is lacking)])
+            first = int(np.flatnonzero(lacking.counts)[0])
+            what = {"score": "scores", "patch_id": "ids"}[name]
+            raise PredictionsError(
+                f"{place(n + first)} (image_id {lacking.image_id[first]}): no {what}, which other images have"
+            )
+    try:
+        named = filled and filled[0].patch_id is not None
+        scored = filled and filled[0].score is not None
+        keypoints = sum(len(part.xy) for part in filled)
+        return Predictions(
+            image_id=np.fromiter(chain.from_iterable(part.image_id for part in parts), np.int64),
+            offsets=_offsets(np.concatenate([np.zeros(0, np.int64), *(part.counts for part in parts)])),
+            xy=np.concatenate([np.zeros((0, 2)), *(part.xy for part in filled)]),
+            score=np.concatenate([part.score for part in filled]) if scored else np.ones(keypoints),
+            patch_id=np.concatenate([part.patch_id for part in filled]) if named else None,
+            **header,
+        )
+    except _Misfit as error:
+        raise PredictionsError(f"{place(error.image)} (image_id {error.image_id}): {error.problem}") from None
+
+
+def _batch(records: list[Any], start: int, place: Callable[[int], str]) -> _Batch:
+    """Columns from one object an image, of which the first is number ``start``.
 
     Types are tested on whole columns; only when a test fails are the values walked through for the first offender.
     """
@@ -264,7 +355,7 @@ def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[i
     columns: dict[str, list[list[Any]]] = {"keypoints": [], "scores": [], "ids": []}
     given = {"scores": 0, "ids": 0}
     filled = 0
-    for n, record in enumerate(records):
+    for n, record in enumerate(records, start):
         if type(record) is not dict or not record.keys() <= RECORD_KEYS or type(record.get("image_id")) is not int:
             raise PredictionsError(f"{place(n)} {_record_problem(record)}")
         image_id.append(record["image_id"])
@@ -290,7 +381,7 @@ def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[i
     for name, count in given.items():
         if 0 < count < filled:
             n = next(i for i, r in enumerate(records) if r["keypoints"] and r.get(name) is None)
-            raise PredictionsError(f"{place(n)} (image_id {image_id[n]}): no {name}, which other images have")
+            raise PredictionsError(f"{place(start + n)} (image_id {image_id[n]}): no {name}, which other images have")
     flat = list(chain.from_iterable(columns["keypoints"]))
     numbers: list[Any] = []
     if set(map(type, flat)) <= {list} and set(map(len, flat)) <= {2}:
@@ -300,18 +391,16 @@ def _from_records(records: list[Any], header: dict[str, Any], place: Callable[[i
     try:
         if not sound or not set(map(type, scores)) <= {float, int} or not set(map(type, ids)) <= {int}:
             raise OverflowError
-        return Predictions(
-            image_id=np.array(image_id, np.int64),
-            offsets=_offsets(list(map(len, columns["keypoints"]))),
-            xy=np.fromiter(numbers, np.float64, len(numbers)).reshape(-1, 2),
-            score=np.fromiter(scores, np.float64, len(scores)) if given["scores"] else np.ones(len(flat)),
-            patch_id=np.fromiter(ids, np.int64, len(ids)) if given["ids"] else None,
-            **header,
+        np.fromiter(image_id, np.int64, len(image_id))
+        return _Batch(
+            image_id,
+            np.fromiter(map(len, columns["keypoints"]), np.int64, len(image_id)),
+            np.fromiter(numbers, np.float64, len(numbers)).reshape(-1, 2),
+            np.fromiter(scores, np.float64, len(scores)) if given["scores"] else None,
+            np.fromiter(ids, np.int64, len(ids)) if given["ids"] else None,
         )
     except OverflowError:
-        raise _first_offender(records, place) from None
-    except _Misfit as error:
-        raise PredictionsError(f"{place(error.image)} (image_id {error.image_id}): {error.problem}") from None
+        raise _first_offender(records, lambda n: place(start + n)) from None
 
 
 def _record_problem(record: Any) -> str:
@@ -354,6 +443,33 @@ def _kind(value: object) -> str:
 def _short(value: object) -> str:
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def coco_results(entries: list[Any]) -> Predictions:
+    """COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``, as predictions.
+
+    Each entry is one detection with one keypoint, whose visibility v is ignored; its patch ID is the category ID less
+    1, as ``kpbench export --format coco`` numbers them. Images without detections are not listed in such a file.
+    """
+    rows: list[tuple[int, float, float, float, int]] = []
+    for n, entry in enumerate(entries):
+        place = f"results[{n}]"
+        if type(entry) is not dict:
+            raise PredictionsError(f"{place} is {_kind(entry)}, expected an object of COCO keypoint results")
+        image_id, category, score = (entry.get(name) for name in ("image_id", "category_id", "score"))
+        point = entry.get("keypoints")
+        if type(image_id) is not int or type(category) is not int or category < 1:
+            found = f"image_id {_short(image_id)} and category_id {_short(category)}"
+            raise PredictionsError(f"{place} has {found}, expected whole numbers, the category from 1")
+        if type(point) is not list or len(point) != 3 or not {type(v) for v in (*point, score)} <= {int, float}:
+            raise PredictionsError(
+                f"{place} (image_id {image_id}): keypoints is {_short(point)} and score {_short(score)}, "
+                "expected [x, y, v] and a number"
+            )
+        rows.append((image_id, point[0], point[1], score or 0, category - 1))
+    columns = [np.array(column) for column in zip(*rows, strict=True)] or [np.zeros(0)] * len(COLUMNS)
+    table = dict(zip(COLUMNS, [columns[0].astype(np.int64), *(c.astype(np.float64) for c in columns[1:])], strict=True))
+    return _from_table(table, {}, lambda row: f"results[{row}]")
 
 
 def _read_csv(path: Path) -> Predictions:

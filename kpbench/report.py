@@ -27,6 +27,7 @@ from kpbench.exhibits import (
     confusion_table,
     count_table,
     difference_table,
+    eps_chart,
     group_table,
     overview_table,
     paper_table,
@@ -42,6 +43,7 @@ from kpbench.scoring import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
 if TYPE_CHECKING:
+    from kpbench.coco import CocoDataset
     from kpbench.gallery import Case
     from kpbench.store import Dataset
 
@@ -159,8 +161,8 @@ def sections(report: Report) -> Iterator[Section]:
         )
     yield Section(
         "Precision and recall",
-        "Which detections to keep: from the surest only to all.",
-        (precision_recall_chart(runs),),
+        "Left: which detections to keep, from the surest only to all. Right: how near a detection must come.",
+        (precision_recall_chart(runs), eps_chart(runs)),
     )
     sized = [g for g in runs[0].by if g.key.radius_px is not None]
     if sized:
@@ -257,7 +259,9 @@ def to_html(report: Report) -> str:
     )
 
 
-def provenance(dataset: Dataset, predictions: Sequence[Path], command: Sequence[str] = ()) -> dict[str, Any]:
+def provenance(
+    dataset: Dataset | CocoDataset, predictions: Sequence[Path], command: Sequence[str] = ()
+) -> dict[str, Any]:
     """What numbers were made from and with: files with their SHA-256, fingerprint, versions; no time, no machine."""
     from importlib.metadata import version
 

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from itertools import pairwise
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.assignment import MATCHED
+from kpbench.assignment import MATCHED, matched_within
 from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import GateFailed, PredictionsError
 from kpbench.keypoints import Detections, Truth
@@ -34,6 +35,7 @@ __all__ = ["Group", "Scores", "check_gates", "evaluate", "score", "summarise"]
 
 SCHEMA = "kpbench.scores/1"
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)  # bins are low < radius <= high
+EPS_GRID = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
 ENDS = ("low", "high")
 
 Int = NDArray[np.int64]
@@ -156,6 +158,19 @@ class Scores:
                 rungs[g.condition].append(g.rung)
         return {name: sorted(values) for name, values in rungs.items() if values}
 
+    @cached_property
+    def eps_curve(self) -> dict[str, list[float | None]]:
+        """``detection_score`` and ``average_false_alarm`` of one-to-one matching when ``eps`` is another."""
+        rows = self.tally
+        keypoints, truths = rows.truth.keypoints, len(rows.truth_id)
+        xy = np.stack([keypoints["x"], keypoints["y"]], axis=1).astype(np.float64)
+        counts = matched_within(xy, rows.truth_image, rows.radius, EPS_GRID, rows.xy, rows.score, rows.image)
+        return {
+            "eps": list(EPS_GRID),
+            "detection_score": [n / truths if truths else None for n in counts],
+            "average_false_alarm": [(len(rows.xy) - n) / len(rows.truth) for n in counts],
+        }
+
     def rows(self) -> list[dict[str, Any]]:
         """A flat table: one row a group, the first overall; bounds end in ``_low`` and ``_high``."""
         return [
@@ -178,6 +193,7 @@ class Scores:
             "by": [{**g.key._asdict(), "metrics": g.to_dict()} for g in self.by],
             "confusion": self.confusion,
             "curve": self.curve,
+            "eps_curve": self.eps_curve,
         }
 
 

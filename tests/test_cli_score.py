@@ -1,11 +1,14 @@
 import csv
 import json
+from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
+from kpbench.interchange import export_dataset
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections
 from kpbench.metrics import COUNTS, METRICS
 from kpbench.predictions import Predictions, write_predictions
@@ -21,6 +24,7 @@ def write_dataset(folder, images, condition="", seed=0):
         for k, (x, y, radius, patch_id) in enumerate(rows):
             keypoints[k]["x"], keypoints[k]["y"], keypoints[k]["patch_id"] = x, y, patch_id
             keypoints[k]["radius_major"] = keypoints[k]["radius_minor"] = radius
+            keypoints[k]["H_patch2image"] = [[radius, 0, x], [0, radius, y], [0, 0, 1]]
         rung = float(n % 2) if condition else float("nan")
         samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
     config = {"seed": seed}
@@ -120,6 +124,8 @@ def test_files_hold_what_the_screen_shows(here):
         for name in METRICS:
             value = group["metrics"][name]
             assert (float(row[name]) if row[name] else None) == value
+    schema = json.loads((Path(__file__).parent.parent / "docs" / "schemas" / "scores-1.json").read_text())
+    jsonschema.Draft202012Validator(schema).validate(content)
     before = (here / "s.json").read_bytes()
     kpbench(*args)
     assert (here / "s.json").read_bytes() == before
@@ -223,3 +229,70 @@ def test_a_folder_that_cannot_be_written_is_one_line(here):
     write_dataset(here / "kpbench-data", IMAGES)
     write_predictions("p.json", perfect())
     assert "no/s.json: cannot be written" in complaint("p.json", "--json", "no/s.json")
+
+
+def test_coco_truth_scores_as_the_dataset_that_it_was_exported_from(here):
+    data = write_dataset(here / "kpbench-data", IMAGES, condition="blur")
+    export_dataset(data, "coco", here / "coco")
+    write_predictions("p.json", perfect([*IMAGES[:3], [(30.5, 30, 20, 0)]]))
+    kpbench("p.json", "--json", "a.json")
+    out = kpbench("p.json", "--gt", "coco/annotations.json", "--json", "b.json", "--report", "r.html").stdout
+    assert "dataset      coco/annotations.json" in out
+    a, b = (json.loads((here / name).read_text()) for name in ("a.json", "b.json"))
+    assert a["metrics"] == b["metrics"]
+    assert a["by"] == b["by"]
+    assert "data:image/jpeg" in (here / "r.html").read_text()
+    for image in (here / "coco" / "images").iterdir():
+        image.unlink()
+    assert "r.html shows no images" in kpbench("p.json", "--gt", "coco/annotations.json", "--report", "r.html").stderr
+    assert json.loads((here / "b.json").read_text())["dataset"]["fingerprint"] == sha256_of(
+        here / "coco/annotations.json"
+    )
+
+
+def test_coco_truth_with_one_radius_and_results(here):
+    content = {
+        "images": [{"id": 5, "file_name": "a.png"}, {"id": 2}],
+        "annotations": [
+            {"image_id": 2, "category_id": 1, "keypoints": [10, 10, 2], "radius": 10},
+            {"image_id": 5, "category_id": 2, "keypoints": [10, 10, 1], "radius_major": 10, "radius_minor": 5},
+            {"image_id": 5, "category_id": 2, "keypoints": [0, 0, 0], "radius": 10},
+        ],
+    }
+    (here / "gt.json").write_text(json.dumps(content))
+    results = [
+        {"image_id": 5, "category_id": 2, "keypoints": [10.5, 10, 1], "score": 0.9},
+        {"image_id": 5, "category_id": 1, "keypoints": [90, 10, 1], "score": 0.2},
+    ]
+    (here / "results.json").write_text(json.dumps(results))
+    assert "no prediction for image_id 2" in complaint("results.json", "--gt", "gt.json")
+    kpbench("results.json", "--gt", "gt.json", "--allow-missing", "--json", "s.json")
+    metrics = json.loads((here / "s.json").read_text())["metrics"]
+    assert metrics["counts"]["truths"] == 2
+    assert (metrics["detection_score"], metrics["id_matching_score"], metrics["average_false_alarm"]) == (0.5, 1, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"radius": None}, "annotations[0]: has no radius"),
+        ({"radius": "4"}, "annotations[0]: radius is 4, expected a finite number"),
+        ({"keypoints": [1, 2]}, "annotations[0]: keypoints is [1, 2], expected one keypoint [x, y, v]"),
+        ({"keypoints": [1, None, 2]}, "annotations[0]: a number of keypoints is None"),
+        ({"image_id": 4}, "annotations[0]: image_id is 4, but there is no such image"),
+        ({"category_id": "1"}, "annotations[0]: category_id is 1, expected a whole number"),
+    ],
+)
+def test_bad_coco_truth_is_one_line(here, change, problem):
+    entry = {"image_id": 0, "category_id": 1, "keypoints": [10, 10, 2], "radius": 10} | change
+    (here / "gt.json").write_text(json.dumps({"images": [{"id": 0}], "annotations": [entry]}))
+    write_predictions("p.json", perfect([[]]))
+    assert complaint("p.json", "--gt", "gt.json").startswith(f"kpbench: gt.json: {problem}")
+
+
+@pytest.mark.parametrize(("text", "problem"), [("{", "no JSON"), ("[]", "has no list 'images' of objects")])
+def test_no_coco_truth_is_one_line(here, text, problem):
+    (here / "gt.json").write_text(text)
+    write_predictions("p.json", perfect([[]]))
+    assert complaint("p.json", "--gt", "gt.json").startswith(f"kpbench: gt.json: {problem}")
+    assert complaint("p.json", "--gt", "none.json").startswith("kpbench: none.json: cannot be read")

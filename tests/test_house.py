@@ -21,7 +21,7 @@ LAYERS = [
     {"sheet", "analysis", "search", "design_figure"},
     {"scene", "degrade"},
     {"camera"},
-    {"store", "predictions", "sources"},
+    {"coco", "store", "predictions", "sources"},
     {"synth", "suite", "samples", "recipe"},
     {"match"},
     {"refine"},
@@ -39,7 +39,7 @@ LAYERS = [
     {"bench"},
 ]
 EVALUATOR = {
-    *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "program", "detect", "store"),
+    *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "coco", "program", "detect", "store"),
     *("sources", "breakpoints", "charts", "comparison", "exhibits", "gallery", "interchange", "paper", "preview"),
     *("report", "tables"),
 }

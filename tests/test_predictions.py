@@ -1,13 +1,16 @@
 import gc
 import json
 import sys
+from pathlib import Path
 
 import h5py
+import jsonschema
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kpbench import predictions
 from kpbench.errors import DataError, PredictionsError
 from kpbench.keypoints import Detections
 from kpbench.predictions import Predictions, read_predictions, write_predictions
@@ -200,7 +203,28 @@ BAD_FILES = [
     ("p.json", json.dumps({**HEADER, "predictions": [record()]})[:-9].encode(), "the file is cut off or no JSON"),
     ("p.json", b"\x89PNG\r\n", "the file is cut off or no JSON"),
     ("p.json", b"[" * 100_000, "the file is cut off or no JSON"),
-    ("p.json", b"[]", "holds a list, expected an object with schema 'kpbench.predictions/1'"),
+    ("p.json", b"3", "holds a number, expected an object with schema 'kpbench.predictions/1'"),
+    ("p.json", b"[3]", "results[0] is a number, expected an object of COCO keypoint results"),
+    (
+        "p.json",
+        b'[{"image_id": 1, "category_id": 0, "keypoints": [1, 2, 2], "score": 1}]',
+        "results[0] has image_id 1 and category_id 0, expected whole numbers, the category from 1",
+    ),
+    (
+        "p.json",
+        b'[{"image_id": 1, "category_id": 1, "keypoints": [1, 2], "score": 1}]',
+        "results[0] (image_id 1): keypoints is [1, 2] and score 1, expected [x, y, v] and a number",
+    ),
+    (
+        "p.json",
+        b'[{"image_id": 1, "category_id": 1, "keypoints": [1, 2, 2]}]',
+        "results[0] (image_id 1): keypoints is [1, 2, 2] and score None, expected [x, y, v] and a number",
+    ),
+    (
+        "p.json",
+        b'[{"image_id": 1, "category_id": 1, "keypoints": [1, NaN, 2], "score": 1}]',
+        "results[0] (image_id 1): y is blank, expected a finite number",
+    ),
     ("p.json", b"{}", "schema is missing, expected 'kpbench.predictions/1'"),
     ("p.json", b'{"schema": "coco"}', "schema is 'coco', expected 'kpbench.predictions/1'"),
     ("p.json", json.dumps(HEADER).encode(), "predictions is missing or null, expected a list"),
@@ -404,3 +428,108 @@ def test_the_json_is_what_the_schema_says(tmp_path):
             "scores": d.score.tolist(),
             "ids": d.patch_id.tolist(),
         }
+
+
+# --- large files, COCO, the schema -------------------------------------------------------------------------------
+
+
+def test_a_file_read_in_pieces_is_the_file_read_whole(tmp_path, monkeypatch):
+    rng = np.random.default_rng(0)
+    counts = rng.integers(0, 4, 60)
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    k = offsets[-1]
+    p = Predictions(
+        np.arange(60), offsets, rng.normal(size=(k, 2)), rng.random(k), rng.integers(0, 4, k), {"a": "}, {"}
+    )
+    for name in ("p.json", "p.jsonl"):
+        write_predictions(tmp_path / name, p)
+        whole = read_predictions(tmp_path / name)
+        for size in (1, 50, 400):
+            monkeypatch.setattr(predictions, "PIECE_BYTES", size)
+            cut = read_predictions(tmp_path / name)
+            for field in ("image_id", "offsets", "xy", "score", "patch_id"):
+                np.testing.assert_array_equal(getattr(cut, field), getattr(whole, field))
+            assert cut.detector == {"a": "}, {"}
+            monkeypatch.undo()
+
+
+RECORD = '{"image_id": %d, "keypoints": [[1, 2]], "scores": [1], "ids": [0]}'
+
+
+@pytest.mark.parametrize(
+    ("records", "problem"),
+    [
+        (f"{RECORD % 0} {RECORD % 1}", "cut off or no JSON"),
+        (f"{RECORD % 0},, {RECORD % 1}", "cut off or no JSON"),
+        (f"{RECORD % 0}, {RECORD % 1},", "cut off or no JSON"),
+        (f"{RECORD % 0}, {RECORD % 0}", r"predictions[1] (image_id 0): the image is there twice, first at 0"),
+        (f"{RECORD % 0}, {RECORD % 1}".replace("1, 2", "1, NaN", 1), "keypoints[0] is [1.0, nan]"),
+        (f'{RECORD % 0}, {{"image_id": 1, "keypoints": [[1, 2]]}}', "predictions[1] (image_id 1): no scores, which"),
+        (f'{RECORD % 0}, {{"image_id": 1, "keypoints": []}}, 7', "predictions[2] is a number, expected an object"),
+    ],
+)
+@pytest.mark.parametrize("size", [1, 10**6])
+def test_pieces_complain_as_the_whole_does(tmp_path, monkeypatch, records, problem, size):
+    monkeypatch.setattr(predictions, "PIECE_BYTES", size)
+    path = tmp_path / "p.json"
+    path.write_text(f'{{"schema": "kpbench.predictions/1", "predictions": [{records}]}}')
+    with pytest.raises(PredictionsError) as error:
+        read_predictions(path)
+    assert problem in str(error.value)
+
+
+def test_what_looks_like_the_list_inside_a_text_is_not_taken_for_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(predictions, "PIECE_BYTES", 1)
+    path = tmp_path / "p.json"
+    content = {
+        "schema": "kpbench.predictions/1",
+        "detector": {"note": '"predictions": [', "predictions": [1]},
+        "predictions": [{"image_id": 4, "keypoints": []}],
+    }
+    path.write_text(json.dumps(content))
+    assert read_predictions(path).image_id.tolist() == [4]
+
+
+def test_coco_results_are_predictions(tmp_path):
+    path = tmp_path / "results.json"
+    entries = [
+        {"image_id": 7, "category_id": 1, "keypoints": [10.25, 20, 2], "score": 0.5},
+        {"image_id": 3, "category_id": 4, "keypoints": [1, 2, 0], "score": 1, "bbox": [0, 0, 1, 1]},
+        {"image_id": 7, "category_id": 2, "keypoints": [3, 4, 1], "score": 0.25},
+    ]
+    path.write_text(json.dumps(entries))
+    p = read_predictions(path)
+    assert p.image_id.tolist() == [3, 7]
+    assert p.offsets.tolist() == [0, 1, 3]
+    assert p.xy.tolist() == [[1, 2], [10.25, 20], [3, 4]]
+    assert p.score.tolist() == [1, 0.5, 0.25]
+    assert p.patch_id.tolist() == [3, 0, 1]
+    path.write_text("[]")
+    assert len(read_predictions(path)) == 0
+
+
+ROOT = Path(__file__).parent.parent
+
+
+def test_the_published_schema_says_what_the_reader_says(tmp_path):
+    schema = json.loads((ROOT / "docs" / "schemas" / "predictions-1.json").read_text())
+    validator = jsonschema.Draft202012Validator(schema)
+    validator.check_schema(schema)
+    detections = [Detections([[1.5, 2]], [0.5], [3]), Detections.none()]
+    p = Predictions.from_detections(detections, detector={"name": "mine"}, dataset="d", fingerprint="f" * 64)
+    write_predictions(tmp_path / "p.json", p)
+    assert not list(validator.iter_errors(json.loads((tmp_path / "p.json").read_text())))
+    good = {"image_id": 0, "keypoints": [[1, 2]], "scores": [1], "ids": [0]}
+    changes = [
+        {}, {"ids": None}, {"image_id": -1}, {"image_id": 1.5}, {"keypoints": [[1, 2, 3]]}, {"keypoints": [["1", 2]]},
+        {"scores": ["1"]}, {"ids": [-1]}, {"ids": [0.5]}, {"score": [1]}, {"keypoints": None},
+    ]  # fmt: skip
+    for change in changes:
+        content = {"schema": "kpbench.predictions/1", "predictions": [good | change]}
+        (tmp_path / "q.json").write_text(json.dumps(content))
+        try:
+            read_predictions(tmp_path / "q.json")
+            read = True
+        except PredictionsError:
+            read = False
+        assert validator.is_valid(content) == read, change

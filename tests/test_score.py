@@ -266,6 +266,17 @@ def test_a_far_detection_raises_only_false_alarms(images, eps):
 
 
 @given(IMAGES)
+@settings(max_examples=40, deadline=None)
+def test_the_curve_over_eps_is_scoring_at_each(images):
+    truth, detections = tables(images)
+    curve = run(truth, detections).eps_curve
+    for n, eps in enumerate(curve["eps"]):
+        alone = run(truth, detections, eps=eps)
+        assert curve["detection_score"][n] == alone["detection_score"]
+        assert curve["average_false_alarm"][n] == alone["average_false_alarm"]
+
+
+@given(IMAGES)
 @settings(max_examples=60, deadline=None)
 def test_a_wider_reach_never_matches_less(images):
     truth, detections = tables(images)

@@ -12,6 +12,7 @@ import click
 from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
+    from kpbench.coco import CocoDataset
     from kpbench.comparison import Comparison
     from kpbench.predictions import Predictions
     from kpbench.scoring import Scores
@@ -49,7 +50,9 @@ def how_to_score(command: Callable[..., None]) -> Callable[..., None]:
     """The options that say what a match is, and against which truth."""
     options = (
         click.option(
-            "--gt", type=click.Path(path_type=Path), help="Dataset; else the one named in PREDS, else ./kpbench-data."
+            "--gt",
+            type=click.Path(path_type=Path),
+            help="Dataset, or COCO annotations (.json); else the one that PREDS names, else ./kpbench-data.",
         ),
         click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii."),
         click.option("--eps-radius", type=click.Choice(["major", "minor", "mean"]), default="major", show_default=True),
@@ -165,7 +168,7 @@ def _check_report(path: Path | None) -> None:
         raise click.UsageError(f"--report {path}: expected a file ending in {', '.join(WRITERS)}")
 
 
-def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tuple[Dataset, list[Scores]]:
+def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tuple[Dataset | CocoDataset, list[Scores]]:
     """The dataset of the first file, and the scores of all; detectors of one name are told apart by their files."""
     from dataclasses import replace
 
@@ -191,26 +194,32 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
 def _write_report(
     path: Path,
     runs: Sequence[Scores],
-    dataset: Dataset,
+    dataset: Dataset | CocoDataset,
     known: dict[str, Any],
     comparisons: Sequence[Comparison] = (),
 ) -> None:
-    from kpbench.gallery import worst_cases
+    from kpbench.errors import DataError
+    from kpbench.gallery import Case, worst_cases
     from kpbench.report import Report, write_report
 
-    pictures = path.suffix.lower() == ".html"
-    cases = tuple(worst_cases(run.tally, dataset.image, 12 // len(runs) or 1) for run in runs) if pictures else ()
+    cases: tuple[tuple[Case, ...], ...] = ()
+    if path.suffix.lower() == ".html":
+        try:
+            cases = tuple(worst_cases(run.tally, dataset.image, 12 // len(runs) or 1) for run in runs)
+        except DataError as error:
+            click.echo(f"kpbench: {path} shows no images: {error}", err=True)
     title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
     write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), title))
 
 
-def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset:
+def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset | CocoDataset:
     """--gt, else the dataset that the file names, else ./kpbench-data."""
+    from kpbench.coco import open_coco
     from kpbench.errors import PredictionsError
     from kpbench.store import open_dataset
 
     if gt:
-        return open_dataset(gt)
+        return open_coco(gt) if gt.suffix.lower() == ".json" and gt.name != "dataset.json" else open_dataset(gt)
     named = predictions.dataset
     for folder in (Path(named), preds.parent / named) if named else ():
         if folder.exists():
