@@ -102,7 +102,7 @@ def match_of(images, eps):
 
 
 @given(IMAGES, EPS)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_the_matching_is_the_best_of_all(images, eps):
     m = match_of(images, eps)
     t0 = d0 = 0
@@ -187,7 +187,7 @@ def test_the_literal_reading_counts_every_detection_in_reach(images, eps):
 
 
 @given(IMAGES, EPS, st.randoms(use_true_random=False))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 def test_no_order_changes_anything(images, eps, random):
     images = [(t, d) for t, d in images if len({k[:2] for k in t}) == len(t)]
     assume(images)
@@ -266,7 +266,7 @@ def test_a_far_detection_raises_only_false_alarms(images, eps):
 
 
 @given(IMAGES)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_the_curve_over_eps_is_scoring_at_each(images):
     truth, detections = tables(images)
     curve = run(truth, detections).eps_curve
@@ -277,7 +277,7 @@ def test_the_curve_over_eps_is_scoring_at_each(images):
 
 
 @given(IMAGES)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_wider_reach_never_matches_less(images):
     truth, detections = tables(images)
     scores = [run(truth, detections, eps=eps) for eps in (0.0, 0.3, 0.5, 1.0, 1.5, 4.0)]
