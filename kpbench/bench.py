@@ -63,6 +63,7 @@ class _Part:
 
     dataset: Path
     detector: str
+    about: dict[str, Any]
     first: int
     count: int
     file: Path
@@ -122,7 +123,7 @@ def bench(
             if file.exists():
                 progress(len(dataset))
             else:
-                parts += _parts(dataset, name, file)
+                parts += _parts(dataset, name, {"name": detector.name, "version": detector.version}, file)
     _detect(parts, workers, progress)
     for _, _, file in runs:
         if not file.exists():
@@ -147,20 +148,27 @@ def _mark(name: str, detector: LoadedDetector) -> str:
     """
     if name.startswith(PROGRAM):
         files = [Path(word) for word in shlex.split(name.removeprefix(PROGRAM)) if Path(word).is_file()]
+    elif name.endswith(".onnx"):
+        files = [Path(name), *_package()]
     else:
         module = importlib.import_module(DETECTORS.get(name, name).partition(":")[0])
-        files = [Path(module.__file__)] if module.__file__ else []
-    package = Path(__file__).parent
-    if any(package in file.parents for file in files):
-        code = [path for path in package.rglob("*.py") if path.parent.name != "cli"]
-        files = sorted([*code, *(package / "weights").iterdir()])
+        own = [Path(module.__file__)] if module.__file__ else []
+        files = _package() if {*own} & {*_package()} else own
     digest = hashlib.sha256(f"{name} {detector.version} {[p.digest for p in shipped_patches()]}".encode())
     for file in files:
         digest.update(hashlib.sha256(file.read_bytes()).digest())
     return digest.hexdigest()
 
 
-def _parts(dataset: store.Dataset, detector: str, file: Path) -> list[_Part]:
+@cache
+def _package() -> list[Path]:
+    """Everything that a shipped detector is made of, and more."""
+    here = Path(__file__).parent
+    code = [path for path in here.rglob("*.py") if path.parent.name != "cli"]
+    return sorted([*code, *(here / "weights").iterdir()])
+
+
+def _parts(dataset: store.Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:
     """The parts of a predictions file, in a folder beside it until all are there."""
     folder = file.with_suffix(".parts")
     try:
@@ -168,7 +176,7 @@ def _parts(dataset: store.Dataset, detector: str, file: Path) -> list[_Part]:
     except OSError as error:
         raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
     return [
-        _Part(dataset.path, detector, first, min(PART, len(dataset) - first), folder / f"{first:08d}.json")
+        _Part(dataset.path, detector, about, first, min(PART, len(dataset) - first), folder / f"{first:08d}.json")
         for first in range(0, len(dataset), PART)
     ]
 
@@ -184,13 +192,10 @@ def _detect_part(part: _Part, progress: Progress) -> None:
     dataset = _opened(part.dataset)
     images = range(part.first, part.first + part.count)
     found = detect_some(dataset, part.detector, None, images, progress)
-    detector = load_detector(part.detector)
     ids = [int(dataset.truth.image_id[n]) for n in images]
     failures = [[image_id, found[n][1]] for n, image_id in zip(images, ids, strict=True) if found[n][1]]
-    about = {"name": detector.name, "version": detector.version} | _said(failures)
-    kept = Predictions.from_detections(
-        [found[n][0] for n in images], ids, about, str(dataset.path), dataset.fingerprint
-    )
+    detections, about = [found[n][0] for n in images], part.about | _said(failures)
+    kept = Predictions.from_detections(detections, ids, about, str(dataset.path), dataset.fingerprint)
     write_predictions(part.file, kept)
 
 
@@ -207,7 +212,7 @@ def _opened(path: Path) -> store.Dataset:
 def _join(file: Path) -> None:
     """One predictions file of all its parts, which are then removed."""
     folder = file.with_suffix(".parts")
-    parts = [read_predictions(path) for path in sorted(folder.iterdir())]
+    parts = [read_predictions(path) for path in sorted(folder.glob("*.json"))]
     about = parts[0].detector | _said([failure for part in parts for failure in part.detector.get("failures", [])])
     found = [detections for part in parts for detections in part.detections()]
     ids = np.concatenate([part.image_id for part in parts])

@@ -109,7 +109,7 @@ def load_detector(name: str) -> LoadedDetector:
         return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
     if name.endswith(".onnx"):
         made = _resolve(SUPERPOINT)(Path(name))
-        return LoadedDetector(made.name, made.version, made.detect)
+        return LoadedDetector(Path(name).stem, made.version, made.detect)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "

@@ -108,7 +108,8 @@ def _report(out: Path, suite: str, runs: list[Benched]) -> None:
         known = provenance(run.dataset, [run.predictions], ["kpbench", *sys.argv[1:]])
         name = f"{run.predictions.stem.rpartition('-')[0]}.json"
         write_atomic(folder / name, scores_file(run.scores, known | {"config": run.dataset.config}))
-    tables = [paper_table(scores, PAPER[name]) for name in scores[0].conditions if name in PAPER]
+    patches = [run.scores for run in runs if run.config.board is None]
+    tables = [paper_table(patches, PAPER[name]) for run in patches[:1] for name in run.conditions if name in PAPER]
     for table in (overview_table(scores), *tables, breakpoint_table(scores)):
         click.echo(to_markdown(table))
     click.echo(f"{out / suite}.html: the report of {suite}\n{folder}: the scores, one file a detector")

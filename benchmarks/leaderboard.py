@@ -1,0 +1,197 @@
+"""The leaderboard, its figure and the README's table from the scores in benchmarks/results.
+
+    python benchmarks/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
+    python benchmarks/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
+
+Of a scores file only what the tables need is kept: all images, and every condition and rung.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from kpbench.charts import STYLE, Series, line_chart
+from kpbench.metrics import LABELS
+from kpbench.paper import PAPER
+from kpbench.tables import Cell, Estimate, Table, to_markdown
+
+ROOT = Path(__file__).parent.parent
+RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"
+PAGE, FIGURE = ROOT / "docs" / "leaderboard.md", ROOT / "docs" / "severity.svg"
+ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
+METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
+PAPER_STYLE = 7
+PANEL = (480, 300)
+
+HEAD = """\
+# Leaderboard
+
+Made by `python benchmarks/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote. All
+images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over each
+table. What boards of tags are, and how far they compare with patches: [benchmark](benchmark.md#patches-against-tags).
+
+To enter a detector: run the command below a heading with `--detector` yours, then
+`python benchmarks/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
+`benchmarks/results`. It names the dataset by its fingerprint, and whoever has the detector gets the same numbers from
+the same command.
+"""
+
+
+def take(folder: Path) -> None:
+    for path in sorted(folder.glob("scores/*/*.json")):
+        scores = json.loads(path.read_text())
+        scores["by"] = [group for group in scores["by"] if group["patch_id"] is None and group["radius_px"] is None]
+        for key in ("confusion", "curve"):
+            del scores[key]
+        scores["detector"].pop("failures", None)
+        target = RESULTS / path.parent.name / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(json.dumps(scores, sort_keys=True) + "\n")
+
+
+def load(suite: Path) -> list[dict[str, Any]]:
+    """Scores of one suite, in the order of the tables."""
+    runs = [json.loads(path.read_text()) for path in sorted(suite.glob("*.json"))]
+    return sorted(runs, key=lambda run: (place(run), run["detector"]["name"]))
+
+
+def place(run: dict[str, Any]) -> int:
+    name = run["detector"]["name"]
+    return ORDER.index(name) if name in ORDER else len(ORDER)
+
+
+def estimate(metrics: dict[str, Any], name: str) -> Estimate:
+    interval = metrics["intervals"].get(name)
+    return Estimate(metrics[name], interval and tuple(interval))
+
+
+def rungs(run: dict[str, Any], condition: str) -> list[tuple[float, dict[str, Any]]]:
+    return sorted((g["rung"], g["metrics"]) for g in run["by"] if g["condition"] == condition)
+
+
+def overall(runs: list[dict[str, Any]]) -> Table:
+    rows = []
+    for run in runs:
+        board = run["provenance"]["config"].get("board", {"name": "patches"})["name"]
+        images = run["metrics"]["counts"]["images"]
+        about = (run["detector"]["name"], run["detector"]["version"], board, images)
+        rows.append((*about, *(estimate(run["metrics"], name) for name in METRICS)))
+    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in METRICS))
+    return Table("All conditions", columns, tuple(rows))
+
+
+def by_rung(runs: list[dict[str, Any]], condition: dict[str, Any]) -> Table:
+    name = condition["name"]
+    rows = [
+        (run["detector"]["name"], *(estimate(m, "detection_score") for _, m in rungs(run, name)), crossing(run, name))
+        for run in runs
+    ]
+    columns = ("detection score", *(f"{rung:g}" for rung in sorted(condition["rungs"])), "crosses 0.9")
+    return Table(name, columns, tuple(rows))
+
+
+def summary(runs: list[dict[str, Any]]) -> Table:
+    """The README's table: the mean over the rungs of each of the paper's conditions."""
+
+    def mean(values: Sequence[float]) -> float:
+        return sum(values) / len(values)
+
+    rows: list[tuple[Cell, ...]] = [
+        ("paper's network", "photographs", *(mean(t.detection_score) for t in PAPER.values()), None),
+        *(
+            (
+                run["detector"]["name"],
+                "simulated",
+                *(mean([m["detection_score"] for _, m in rungs(run, name)]) for name in PAPER),
+                estimate(run["metrics"], "average_false_alarm"),
+            )
+            for run in runs
+        ),
+    ]
+    return Table("", ("detection score", "images", *PAPER, "false alarms an image"), tuple(rows))
+
+
+def readme(text: str, runs: list[dict[str, Any]]) -> str:
+    """The README with its table made anew."""
+    table = to_markdown(summary(runs)).partition("\n\n")[2]
+    return re.sub(r"(?s)(<!-- benchmarks/leaderboard.py -->\n).*?(?=<!-- end -->)", rf"\g<1>{table}", text)
+
+
+def crossing(run: dict[str, Any], condition: str) -> str:
+    found = [b for b in run["breakpoints"] if b["condition"] == condition]
+    return "; ".join(b["crossing"] + (f" at {b['rung']:.3g}" if b["rung"] is not None else "") for b in found)
+
+
+def figure(runs: list[dict[str, Any]]) -> str:
+    """Detection score over the paper's five conditions, and whose line is whose."""
+    panels = []
+    for table in PAPER.values():
+        series = []
+        for n, run in enumerate(runs):
+            found = [(rung, estimate(metrics, "detection_score")) for rung, metrics in rungs(run, table.condition)]
+            x, y = [rung for rung, _ in found], [e.value for _, e in found]
+            series.append(Series(run["detector"]["name"], x, y, [e.interval for _, e in found], n + (n >= PAPER_STYLE)))
+        paper = Series("paper", table.rungs, table.detection_score, style=PAPER_STYLE, dashed=True)
+        unit = f" ({table.unit})" if table.unit else ""
+        label, log = f"{table.title}{unit}", table.condition == "scale"
+        panels.append(
+            line_chart([*series, paper], label, "detection score", y_range=(0, 1), x_ticks=table.rungs, log_x=log)
+        )
+    names = [*((n + (n >= PAPER_STYLE), run["detector"]["name"]) for n, run in enumerate(runs))]
+    names.append((PAPER_STYLE, "the paper, photographs (dashed); all others: simulated"))
+    legend = "".join(
+        f'<circle class="s{style % 8}" cx="60" cy="{30 + 26 * row}" r="6"/>'
+        f'<text x="78" y="{34 + 26 * row}">{name}</text>'
+        for row, (style, name) in enumerate(names)
+    )
+    inside = [re.sub(r"^<svg[^>]*>|</svg>$", "", panel) for panel in panels] + [legend]
+    width, height = 2 * PANEL[0], 3 * PANEL[1]
+    cells = "".join(
+        f'<g class="chart" transform="translate({n % 2 * PANEL[0]} {n // 2 * PANEL[1]})">{part}</g>'
+        for n, part in enumerate(inside)
+    )
+    own = ":root{color:#1c1e21;font:12px system-ui,sans-serif}@media (prefers-color-scheme:dark){:root{color:#e6e8eb}}"
+    about = "Detection score over severity, simulated, beside the paper's photographs"
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{about}" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}"><style>{own}{STYLE}</style>{cells}</svg>\n'
+    )
+
+
+def page(results: Path) -> tuple[str, str]:
+    """The page as Markdown, and its figure as SVG."""
+    parts, picture = [HEAD], ""
+    for suite in sorted(results.iterdir(), reverse=True):
+        runs = load(suite)
+        config = runs[0]["provenance"]["config"]
+        if suite.name == "paper-v1":
+            parts.append("![Detection score over severity](severity.svg)\n")
+            picture = figure(runs)
+        size = "x".join(map(str, config["size_px"]))
+        command = f"kpbench bench --suite {suite.name} --images {config['images']} --size {size}"
+        parts.append(f"## `{suite.name}`, {size}, {config['images']} scenes\n")
+        parts.append(f"Seed {config['seed']}, {config['backgrounds']['kind']} backgrounds: `{command}`\n")
+        parts.append(to_markdown(overall(runs)))
+        parts += [to_markdown(by_rung(runs, condition)) for condition in config["conditions"]]
+    return "\n".join(parts), picture
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--take", type=Path, metavar="FOLDER", help="copy the scores of a `kpbench bench` folder first")
+    folder = parser.parse_args().take
+    if folder:
+        take(folder)
+    text, picture = page(RESULTS)
+    README.write_text(readme(README.read_text(), load(RESULTS / "paper-v1")))
+    PAGE.write_text(text)
+    FIGURE.write_text(picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,48 @@
+"""The published results, and the page that is made from them."""
+
+import importlib.util
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from kpbench.suite import SuiteConfig, load_suite
+
+ROOT = Path(__file__).parent.parent
+RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
+
+spec = importlib.util.spec_from_file_location("leaderboard", ROOT / "benchmarks" / "leaderboard.py")
+leaderboard = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(leaderboard)
+
+
+@pytest.mark.parametrize("path", RESULTS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_a_result_follows_from_its_counts_and_names_a_frozen_suite(path):
+    scores = json.loads(path.read_text())
+    assert scores["schema"] == "kpbench.scores/1"
+    assert scores["settings"]["eps"] == 0.1
+    assert re.sub("[^A-Za-z0-9.]+", "-", scores["detector"]["name"]) == path.stem
+    config = scores["provenance"]["config"]
+    assert config["suite"] == path.parent.name
+    board = config["board"]["name"] if "board" in config else None
+    size = tuple(config["size_px"])
+    again = SuiteConfig(load_suite(config["suite"]), config["images"], config["seed"], size, board=board)
+    assert again.to_dict()["conditions"] == config["conditions"]
+    assert scores["dataset"]["images"] == config["n"] == again.n
+    for group in [scores["metrics"], *(group["metrics"] for group in scores["by"])]:
+        n = group["counts"]
+        assert group["detection_score"] == n["matched"] / n["truths"]
+        assert group["average_false_alarm"] == (n["detections"] - n["matched"]) / n["images"]
+        if group["id_matching_score"] is not None:
+            assert group["id_matching_score"] == n["id_correct"] / n["matched"]
+    rungs = {(group["condition"], group["rung"]) for group in scores["by"]}
+    assert rungs == {(c["name"], rung) for c in config["conditions"] for rung in c["rungs"]}
+
+
+def test_the_leaderboard_and_the_readme_are_made_of_the_results():
+    readme = (ROOT / "README.md").read_text()
+    assert leaderboard.readme(readme, leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")) == readme
+    text, picture = leaderboard.page(ROOT / "benchmarks" / "results")
+    assert (ROOT / "docs" / "leaderboard.md").read_text() == text
+    assert (ROOT / "docs" / "severity.svg").read_text() == picture
