@@ -30,8 +30,8 @@ def design_figure(analysis: Analysis, patches: Sequence[Patch]) -> Page:
     for x, title in (
         (LEFT, "design"),
         (LEFT + 2 * ICON + 4, f"at {SEEN_PX:g} px radius"),
-        (BARS_X, "bound of the centre (px) and basin"),
-        (PAIRS_X, "distance to the others"),
+        (BARS_X, "bound, px (short is good); basin (long)"),
+        (PAIRS_X, "distance to the others (long is good)"),
     ):
         texts.append(Text(title, x, TOP - 5, FONT))
     for n, (patch, report) in enumerate(zip(patches, analysis.designs, strict=True)):

@@ -52,18 +52,27 @@ def bounds_table():
     }
     for n, patch in enumerate(shipped_patches()):
         print(f"{patch.name:24}", *(f"{worst[tilt][k][n]:.4f}" for tilt in worst for k in range(len(SIZES_PX))))
+    family, inks = search.FAMILY_GRID, list(crossings())[1]
+    medians = [np.median(disc_bound(family, inks, r, tilt)[0]) for tilt in worst for r in SIZES_PX]
+    no_rim = np.median(disc_bound(family, inks, SIZES_PX[0], rim=False)[0])
+    print(f"{'family median':24}", *(f"{m:.4f}" for m in medians), f"and without the rim at 5 px {no_rim:.4f}")
     for name, tag in (("AprilTag 36h11 corner", "DICT_APRILTAG_36h11"), ("ArUco 4x4 corner", "DICT_4X4_50")):
         print(
             f"{name:24}", *(f"{tag_corner(getattr(cv2.aruco, tag), r, t):.4f}" for t in (0.0, 60.0) for r in SIZES_PX)
         )
 
 
-def family_measures(windows):
-    """Codes and measures of all designs that some limit below lets through."""
+def crossings():
+    """Codes and inks of the family's designs whose centre is a crossing."""
     codes = search.enumerate_family().classes
     inks = search.inks_of(codes)
     edges = inks[:, :8] != np.roll(inks[:, :8], 1, axis=1)
-    codes, inks = (a[(edges[:, :4] | edges[:, 4:]).sum(1) >= 2] for a in (codes, inks))
+    return (a[(edges[:, :4] | edges[:, 4:]).sum(1) >= 2] for a in (codes, inks))
+
+
+def family_measures(windows):
+    """Codes and measures of all designs that some limit below lets through."""
+    codes, inks = crossings()
     grid = search.FAMILY_GRID
     pixels = pixels_needed(grid, inks)
     codes, inks, pixels = (a[pixels <= 5] for a in (codes, inks, pixels))
