@@ -45,6 +45,7 @@ __all__ = [
     "bound",
     "correlation_and_distance",
     "disc_bound",
+    "mirrored_distance",
     "natural_response",
     "pixels_needed",
     "sample_windows",
@@ -241,12 +242,21 @@ def correlation_and_distance(
 
 def turned_distance(grid: Grid, inks: Float32) -> Float:
     """Smallest distance of each design to itself, turned in the plane by 45 degrees or more, shape (n,)."""
+    return _distance_turned(grid, inks, inks, range(TURNS // 8, TURNS - TURNS // 8 + 1))
+
+
+def mirrored_distance(grid: Grid, inks: Float32) -> Float:
+    """Smallest distance of each design to its mirror image, turned in the plane by any angle, shape (n,)."""
+    return _distance_turned(grid, inks, grid.mirrored(inks), range(TURNS))
+
+
+def _distance_turned(grid: Grid, inks: Float32, others: Float32, turns: range) -> Float:
     weight = window_weights(np.eye(2)[None])[0]
-    still, *turned = seen_cells(grid, attitudes(TURNS, (0.0,)), 1.0)
-    first, spread = moments(weight, still, inks)
+    views = seen_cells(grid, attitudes(TURNS, (0.0,)), 1.0)
+    first, spread = moments(weight, views[0], inks)
     best = np.zeros(len(inks))
-    for cells in turned[TURNS // 8 - 1 : TURNS - TURNS // 8]:
-        other, other_spread = moments(weight, cells, inks)
+    for turn in turns:
+        other, other_spread = moments(weight, views[turn], others)
         best = np.maximum(best, np.einsum("np,np,p->n", first, other, weight) / (spread * other_spread))
     return np.asarray(spread * np.sqrt(np.maximum(1 - best**2, 0)))
 
@@ -362,6 +372,7 @@ class DesignReport:
     centre_is_crossing: bool
     symmetry_order: int
     turned_distance: float
+    mirrored_distance: float
     tilt_bias_px: float
     black_fraction: float
     pixels_needed: float
@@ -447,6 +458,7 @@ def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], Non
     measures = zip(
         patches,
         turned_distance(grid, inks),
+        mirrored_distance(grid, inks),
         _black_fraction(grid, inks),
         pixels_needed(grid, inks),
         bounds,
@@ -463,6 +475,7 @@ def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], Non
             p.centre_is_crossing,
             symmetry_order(p),
             float(turned),
+            float(mirrored),
             tilt_bias(p),
             float(black),
             float(pixels),
@@ -472,7 +485,7 @@ def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], Non
             tuple(sharp.tolist()),
             tuple(blurred.tolist()),
         )
-        for p, turned, black, pixels, found, hidden, bound_to_centre, sharp, blurred in measures
+        for p, turned, mirrored, black, pixels, found, hidden, bound_to_centre, sharp, blurred in measures
     )
     return Analysis(reports, correlation, distance)
 

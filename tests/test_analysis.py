@@ -164,6 +164,9 @@ def test_the_shipped_designs_tell_their_orientation_but_for_the_checker():
     turned = measured(["checker", "wheel"], analysis.turned_distance)
     assert turned[0] == pytest.approx(0.0, abs=1e-3)
     assert turned[1] > 0.1
+    mirrored = measured(["checker", "trefoil", "wheel", "mushroom", "nested-halves"], analysis.mirrored_distance)
+    np.testing.assert_allclose(mirrored[:4], 0.0, atol=1e-3)
+    assert mirrored[4] > 0.1
 
 
 # --- Nature -------------------------------------------------------------------------------------------

@@ -110,6 +110,7 @@ def _table(analysis: Analysis) -> str:
         "tilt bias px",
         "basin",
         "turns alike",
+        "mirror",
         "needs px",
         "in images",
         "blurred",
@@ -121,7 +122,7 @@ def _table(analysis: Analysis) -> str:
         name, distance = analysis.nearest(n)
         crossing = "yes" if d.centre_is_crossing else "no"
         shares = (f"{100 * d.natural_response[0]:.3f} %", f"{100 * d.natural_response_blurred[0]:.2f} %")
-        measures = (f"{d.basin:.3f}", str(d.symmetry_order), f"{d.pixels_needed:.1f}")
+        measures = (f"{d.basin:.3f}", str(d.symmetry_order), f"{d.mirrored_distance:.3f}", f"{d.pixels_needed:.1f}")
         rows.append([crossing, f"{d.tilt_bias_px:.2f}", *measures, *shares, name or "-", f"{distance:.3f}"])
     lines += _columns(names, head, rows)
     if len(names) > 1:
