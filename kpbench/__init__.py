@@ -19,7 +19,7 @@ _HOMES = {
     "Predictions": "predictions",
     "Truth": "keypoints",
     "compare": "comparison",
-    "generate": "pipeline",
+    "generate": "generation",
     "load_detector": "detect",
     "load_patches": "design",
     "open_dataset": "store",

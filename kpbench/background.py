@@ -7,13 +7,15 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
-from kpbench.keypoints import UInt8
+from kpbench.keypoints import Float, UInt8
 
 __all__ = ["Background", "PhotoFolder", "procedural"]
 
@@ -85,7 +87,7 @@ class PhotoFolder:
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
-        image = _decode((self.path / name), channels)
+        image = decode_photo((self.path / name), channels)
         self._cache[key] = image
         self._cached_bytes += 0 if image is None else image.nbytes
         while self._cached_bytes > CACHE_BYTES and len(self._cache) > 1:
@@ -120,7 +122,7 @@ class PhotoFolder:
         raise DataError(f"{self.path}: its image files can no longer be decoded")
 
 
-def _decode(path: Path, channels: int) -> UInt8 | None:
+def decode_photo(path: Path, channels: int) -> UInt8 | None:
     flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         data = np.fromfile(path, np.uint8)
@@ -153,28 +155,40 @@ def procedural(rng: np.random.Generator, width_px: int, height_px: int, channels
     ndarray of shape (height_px, width_px) or (height_px, width_px, 3), uint8
     """
     long_side = max(width_px, height_px)
-    canvas = np.full((height_px, width_px, channels), rng.uniform(40, 215), np.float32)
+    canvas = np.full((height_px, width_px, channels), round(rng.uniform(40, 215)), np.uint8)
     count, smallest, largest = 700, 0.008, 0.35  # radii in long sides; so many cover the frame about twice
     radius = smallest * long_side / np.sqrt(1 - rng.random(count) * (1 - (smallest / largest) ** 2))
     centre = rng.uniform(0, 1, (count, 2)) * (width_px, height_px)
     ratio, angle = rng.uniform(0.3, 1.0, count), rng.uniform(0, 360, count)
-    grey = np.clip(rng.normal(127, 62, (count, 1)) + rng.normal(0, 18, (count, channels)), 0, 255)
+    grey = np.clip(rng.normal(127, 62, (count, 1)) + rng.normal(0, 18, (count, channels)), 0, 255).round()
     square = rng.random(count) < 0.4
-    for n in range(count):
-        if square[n]:
-            corners = cv2.boxPoints(((centre[n, 0], centre[n, 1]), (2 * radius[n], 2 * radius[n] * ratio[n]), angle[n]))
-            cv2.fillConvexPoly(canvas, np.round(corners * 16).astype(np.int32), grey[n].tolist(), cv2.LINE_8, 4)
-        else:
-            axes = (int(16 * radius[n]), int(16 * radius[n] * ratio[n]))
-            middle = (int(16 * centre[n, 0]), int(16 * centre[n, 1]))
-            cv2.ellipse(canvas, middle, axes, angle[n], 0, 360, grey[n].tolist(), -1, cv2.LINE_8, 4)
-    texture = np.zeros((height_px, width_px), np.float32)
+    round_ = _leaves(_circle(48), centre, radius, ratio, angle)
+    edged = _leaves(np.sqrt(2) * _circle(4, 45), centre, radius, ratio, angle)
+    for is_square, ellipse, corners, colour in zip(square.tolist(), round_, edged, grey.tolist(), strict=True):
+        cv2.fillConvexPoly(canvas, corners if is_square else ellipse, colour, cv2.LINE_8, 4)
     strength = rng.uniform(2, 14)
-    for octave in range(1, 8):
-        cells = (max(2, width_px >> octave), max(2, height_px >> octave))
-        noise = rng.standard_normal(cells[::-1], dtype=np.float32)
-        texture += np.float32(strength * 2 ** (octave / 2 - 2)) * cv2.resize(noise, (width_px, height_px))
-    canvas += texture[..., None]
+    sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, 8)]
+    octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
+    texture: Any = np.zeros((2, 2), np.float32)
+    for octave in range(7, 0, -1):  # from coarse to fine, each on top of the ones before
+        texture = cv2.resize(texture, sizes[octave - 1])
+        texture += np.float32(strength * 2 ** (octave / 2 - 2)) * octaves[octave - 1]
+    texture = cv2.resize(texture, (width_px, height_px))
     smooth = cv2.GaussianBlur(canvas, (0, 0), 0.7)
-    image = np.clip(np.rint(smooth), 0, 255).astype(np.uint8)
-    return image.reshape(height_px, width_px) if channels == 1 else image
+    if channels == 3:
+        texture = cv2.merge([texture] * 3)
+    return np.asarray(cv2.add(smooth, texture, dtype=cv2.CV_8U), np.uint8)
+
+
+def _circle(count: int, start_deg: float = 0.0) -> Float:
+    """Corners on the unit circle, shape (count, 2)."""
+    angles = np.radians(start_deg) + np.arange(count) * (2 * np.pi / count)
+    return np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def _leaves(corners: Float, centre: Float, radius: Float, ratio: Float, angle_deg: Float) -> NDArray[np.int32]:
+    """One polygon stretched, turned and placed many times, in 1/16 px as OpenCV draws: (count, corners, 2)."""
+    c, s = np.cos(np.radians(angle_deg))[:, None], np.sin(np.radians(angle_deg))[:, None]
+    u, v = corners[:, 0] * radius[:, None], corners[:, 1] * (radius * ratio)[:, None]
+    points = np.stack([c * u - s * v, s * u + c * v], axis=-1) + centre[:, None]
+    return np.rint(points * 16).astype(np.int32)

@@ -24,7 +24,8 @@ from kpbench import __version__, store
 from kpbench.design import shipped_patches
 from kpbench.detect import DETECTORS, PROGRAM, LoadedDetector, load_detector
 from kpbench.errors import DataError
-from kpbench.pipeline import detect_some, generate
+from kpbench.generation import generate
+from kpbench.pipeline import detect_some
 from kpbench.predictions import Predictions, read_predictions, write_predictions
 from kpbench.scoring import Scores, score
 from kpbench.suite import SuiteConfig

@@ -19,7 +19,16 @@ from numpy.typing import ArrayLike
 
 from kpbench.keypoints import Float
 
-__all__ = ["Camera", "Ellipse", "jacobian", "plane_to_camera", "project", "projected_disc", "rotation_xyz"]
+__all__ = [
+    "Camera",
+    "Ellipse",
+    "jacobian",
+    "plane_to_camera",
+    "project",
+    "projected_disc",
+    "projected_discs",
+    "rotation_xyz",
+]
 
 
 def project(H_a2b: Float, points_a: ArrayLike) -> Float:
@@ -57,28 +66,47 @@ class Ellipse:
     angle_deg: float
 
 
-def projected_disc(H_patch2image: Float) -> Ellipse:
-    """Image of the unit circle under a homography.
+def projected_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
+    """Images of the unit circle under many homographies.
 
     The dual conic of the unit circle is diag(1, 1, -1); under H it becomes H C* Hᵀ (Hartley and
     Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). Its centre is *not* the image of the
     disc's centre unless H is affine.
+
+    Parameters
+    ----------
+    H_patch2image : ndarray of shape (N, 3, 3)
+
+    Returns
+    -------
+    centre : ndarray of shape (N, 2), px
+    major, minor : ndarray of shape (N,), semi-axes, px
+    angle_deg : ndarray of shape (N,), of the major axis, in [0, 180)
+        All are nan where the disc touches or crosses the camera's horizon: its image is no ellipse.
+    """
+    dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        dual = np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan)
+    x, y = dual[:, 0, 2], dual[:, 1, 2]
+    xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
+    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    major, minor = np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
+    angle_deg = np.degrees(np.arctan2(2 * xy, xx - yy) / 2) % 180.0
+    return dual[:, :2, 2], major, minor, angle_deg
+
+
+def projected_disc(H_patch2image: Float) -> Ellipse:
+    """Image of the unit circle under one homography, see :func:`projected_discs`.
 
     Raises
     ------
     ValueError
         If the disc touches or crosses the camera's horizon, so that its image is no ellipse.
     """
-    dual = H_patch2image @ np.diag([1.0, 1.0, -1.0]) @ H_patch2image.T
-    if dual[2, 2] >= 0:
+    centre, major, minor, angle_deg = projected_discs(H_patch2image[None])
+    if np.isnan(major[0]):
         raise ValueError("the disc reaches the horizon of the camera: its image is not an ellipse")
-    dual = dual / dual[2, 2]
-    x, y = dual[0, 2], dual[1, 2]
-    shape = np.array([[x * x, x * y], [x * y, y * y]]) - dual[:2, :2]
-    values, vectors = np.linalg.eigh(shape)
-    minor, major = np.sqrt(np.maximum(values, 0.0))
-    angle_deg = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180.0
-    return Ellipse(float(x), float(y), float(major), float(minor), float(angle_deg))
+    return Ellipse(float(centre[0, 0]), float(centre[0, 1]), float(major[0]), float(minor[0]), float(angle_deg[0]))
 
 
 def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:

@@ -8,6 +8,7 @@ length, not with the area.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from kpbench.keypoints import Float
 
-__all__ = ["Box", "box_around", "coverage"]
+__all__ = ["Box", "box_around", "coverage", "edge_coverage"]
 
 Box = tuple[int, int, int, int]
 """Columns and rows of a pixel rectangle: (x, y, width, height); may reach outside the image."""
@@ -23,10 +24,9 @@ Box = tuple[int, int, int, int]
 
 def box_around(polygons: Sequence[Float]) -> Box:
     """The smallest box that :func:`coverage` accepts for these polygons (a one-pixel margin)."""
-    points = np.concatenate(list(polygons))
-    low = np.floor(points.min(axis=0) + 0.5).astype(int) - 1
-    high = np.floor(points.max(axis=0) + 0.5).astype(int) + 2
-    return int(low[0]), int(low[1]), int(high[0] - low[0]), int(high[1] - low[1])
+    x, y = np.concatenate(list(polygons)).T
+    left, top = math.floor(x.min() + 0.5) - 1, math.floor(y.min() + 0.5) - 1
+    return left, top, math.floor(x.max() + 0.5) + 2 - left, math.floor(y.max() + 0.5) + 2 - top
 
 
 def coverage(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[Float]:
@@ -45,53 +45,62 @@ def coverage(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[F
     list of ndarray of shape (height, width), float64
         Covered fraction of each pixel, in [0, 1].
     """
-    sizes = np.array([w * h for _, _, w, h in boxes], np.int64)
-    offsets = np.concatenate([[0], np.cumsum(sizes)])
-    start, end, offset, stride = [], [], [], []
-    for polygons, (x, y, width, _), base in zip(regions, boxes, offsets[:-1], strict=True):
-        corner = np.array([x - 0.5, y - 0.5])
-        for polygon in polygons:
-            shifted = polygon - corner
-            start.append(shifted)
-            end.append(np.roll(shifted, -1, axis=0))
-            offset.append(np.full(len(polygon), base, np.int64))
-            stride.append(np.full(len(polygon), width, np.int64))
-    if not start:
+    polygons = [polygon for region in regions for polygon in region]
+    owner = np.repeat(np.arange(len(regions)), [sum(map(len, region)) for region in regions])
+    if not len(owner):
         return [np.zeros((h, w)) for _, _, w, h in boxes]
-    flat = _accumulate(
-        np.concatenate(start), np.concatenate(end), np.concatenate(offset), np.concatenate(stride), int(offsets[-1])
-    )
-    covered = []
-    for (_, _, width, height), low, high in zip(boxes, offsets[:-1], offsets[1:], strict=True):
-        area = flat[low:high]
-        covered.append(np.clip(area if area.sum() >= 0 else -area, 0.0, 1.0).reshape(height, width))
-    return covered
+    ends = [np.roll(polygon, -1, axis=0) for polygon in polygons]
+    return edge_coverage(np.concatenate(polygons).T, np.concatenate(ends).T, owner, boxes)
+
+
+def edge_coverage(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
+    """:func:`coverage` of regions given by their edges.
+
+    Parameters
+    ----------
+    start, end : ndarray of shape (2, N), rows x and y, px
+    owner : ndarray of shape (N,)
+        The place in ``boxes`` of the region that an edge belongs to; the edges of each close up.
+    boxes : sequence of Box
+    """
+    x, y, width, height = np.array(boxes, np.int64).reshape(-1, 4).T
+    base = np.concatenate([[0], np.cumsum(width * height)])
+    corner = np.stack([x - 0.5, y - 0.5])[:, owner]
+    signed = _accumulate(start - corner, end - corner, base[owner], width[owner], int(base[-1]))
+    # a region's running sum ends at zero, so one sum serves them all; abs, because outlines may run either way round
+    covered = np.cumsum(signed)
+    np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
+    return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
 
 
 def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDArray[np.int64], total: int) -> Float:
-    """Signed coverage of all pixels, flat, from edges given in box pixels (pixel i spans [i, i + 1))."""
+    """Signed area of every pixel, and height for those on its right, from edges in box pixels.
+
+    Pixel i spans [i, i + 1). The running sum of the result along the rows is the coverage.
+    """
     step = end - start
-    edge = [np.arange(len(start))]
-    cut = [np.zeros(len(start))]
-    for axis in (0, 1):
-        first, last = np.floor(start[:, axis]), np.floor(end[:, axis])
-        count = np.abs(last - first).astype(np.int64)
-        which = np.repeat(edge[0], count)
-        nth = np.arange(len(which)) - np.repeat(np.cumsum(count) - count, count)
-        rising = step[which, axis] > 0
-        border = np.where(rising, first[which] + 1 + nth, first[which] - nth)
-        edge.append(which)
-        cut.append((border - start[which, axis]) / step[which, axis])
-    edges, t = np.concatenate(edge), np.concatenate(cut)
-    order = np.lexsort((t, edges))
-    edges, t = edges[order], t[order]
-    t_end = np.append(t[1:], 1.0)
-    t_end[np.append(edges[1:] != edges[:-1], True)] = 1.0
-    a = start[edges] + t[:, None] * step[edges]
-    height = (t_end - t) * step[edges, 1]
-    middle = a + 0.5 * (t_end - t)[:, None] * step[edges]
-    pixel = np.floor(middle).astype(np.int64)
-    right = height * (middle[:, 0] - pixel[:, 0])
-    index = offset[edges] + pixel[:, 1] * stride[edges] + pixel[:, 0]
-    signed = np.bincount(index, height - right, total) + np.bincount(index + 1, right, total + 1)[:total]
-    return np.cumsum(signed)
+    # parts shorter than a pixel, which cross one border of a kind at most
+    parts = np.maximum(np.abs(step[0]), np.abs(step[1])).astype(np.int64) + 1
+    which = np.repeat(np.arange(len(parts)), parts)
+    if len(which) > len(parts):
+        nth = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
+        step = step[:, which] / parts[which]
+        start, offset, stride = start[:, which] + nth * step, offset[which], stride[which]
+        end = start + step
+    first, last = np.floor(start), np.floor(end)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        cut = np.where(first != last, (np.maximum(first, last) - start) / step, 0.0)
+    early, late = np.minimum(cut[0], cut[1]), np.maximum(cut[0], cut[1])
+    # up to three pieces: to the first border, between the two, and on to the end, which every part has
+    one, two = np.flatnonzero(early), np.flatnonzero(late > early)
+    edge = np.concatenate([one, two, np.arange(len(late))])
+    begin = np.concatenate([np.zeros(len(one)), early[two], late])
+    share = np.concatenate([early[one], late[two], np.ones(len(late))]) - begin
+    across = step[:, edge]
+    middle = start[:, edge] + (begin + 0.5 * share) * across
+    pixel = np.floor(middle)
+    height = share * across[1]
+    right = height * (middle[0] - pixel[0])
+    index = (offset[edge] + pixel[1] * stride[edge] + pixel[0]).astype(np.int64)
+    weights: Float = np.concatenate([height - right, right])
+    return np.asarray(np.bincount(np.concatenate([index, index + 1]), weights, total + 1)[:total], np.float64)

@@ -16,7 +16,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -26,10 +25,11 @@ from numpy.typing import NDArray
 
 from kpbench import degrade
 from kpbench.background import PhotoFolder, procedural
-from kpbench.design import Patch, unit_polygons
+from kpbench.design import Patch
+from kpbench.geometry import projected_discs
 from kpbench.keypoints import Float, UInt8
-from kpbench.raster import Box, box_around, coverage
-from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.lookalikes import draw_lookalikes
+from kpbench.scene import Limits, Placement, paint, random_placements, random_poses, rasterise, render_scene
 
 __all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]
 
@@ -37,7 +37,7 @@ Float32 = NDArray[np.float32]
 
 MOST_KEYPOINTS = 12
 VALIDATION_EVERY = 10
-IMAGE_WIDTH_PX = 640  # the image that a crop is thought to be cut from: focal lengths are relative to it
+IMAGE_PX = (640, 480)  # the image that a crop is thought to be cut from: focal lengths are relative to it
 ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
 DETECTABLE = 15.0
 """Least contrast / noise · √area of a keypoint that is asked for: 7.5 sigma at the output of a matched filter."""
@@ -230,15 +230,12 @@ def _no_keypoints(count: int) -> Float32:
 class Disc(NamedTuple):
     """One patch that is to be drawn into a crop; ``place`` is its place in the design set."""
 
-    patch: Patch
+    placement: Placement
     place: int
-    H_patch2image: Float
     x: float
     y: float
     major: float
     minor: float
-    black: float
-    white: float
 
 
 def _crops(
@@ -257,20 +254,20 @@ def _crops(
     for _ in range(count):
         image = _background(photos, rng, width, height)
         if rng.random() < 0.5:
-            _distract(image, rng)
+            draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
         drawn = _lay_out(rng, patches, image)
         discs.append(drawn)
         canvases.append(image)
     _paint_all(canvases, discs)
     for n in range(count):
-        hidden = _occlude(canvases[n], rng, discs[n]) if rng.random() < 0.08 * severity else ()
+        hidden = _occlude(canvases[n], rng, discs[n], patches) if rng.random() < 0.08 * severity else ()
         radius = min((d.minor for d in discs[n]), default=20.0)
         image, gain, kernel, sigma = _degrade(canvases[n], rng, severity, radius)
         images[n] = image
         inside = [d for d in discs[n] if -0.5 <= d.x < width - 0.5 and -0.5 <= d.y < height - 0.5]
         for k, disc in enumerate(inside[:MOST_KEYPOINTS]):
             kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
-            contrast = gain * (disc.white - disc.black) * max(kept, 0.0)
+            contrast = gain * (disc.placement.white - disc.placement.black) * max(kept, 0.0)
             area = np.pi * disc.major * disc.minor
             buried = contrast < max(FAINTEST, DETECTABLE * sigma / np.sqrt(area))
             small = disc.minor < 0.5 * Limits().minor_axis_px
@@ -309,53 +306,6 @@ def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, h
     return image
 
 
-def random_poses(rng: np.random.Generator, count: int, limits: Limits) -> Float:
-    """Homographies of :func:`kpbench.scene.random_placements`, many at a time, keypoint at (0, 0).
-
-    Returns
-    -------
-    ndarray of shape (count, 3, 3)
-        H_patch2image; H[:, 2, 2] = 1.
-    """
-    found: list[Float] = []
-    missing = count
-    while missing > 0:
-        n = 2 * missing + 8
-        focal = IMAGE_WIDTH_PX * np.exp(rng.uniform(*_log(limits.focal), n))
-        (cx, cy), (sx, sy) = np.cos(a := np.radians(rng.uniform(-1, 1, (2, n)) * limits.tilt_deg)), np.sin(a)
-        cz, sz = np.cos(b := rng.uniform(0, 2 * np.pi, n)), np.sin(b)
-        radius = np.exp(rng.uniform(*_log(limits.radius_px), n))
-        x, y = rng.uniform(-0.5, 0.5, n) * IMAGE_WIDTH_PX, rng.uniform(-0.375, 0.375, n) * IMAGE_WIDTH_PX
-        H = np.empty((n, 3, 3))
-        # columns of Rx @ Ry @ Rz (geometry.rotation_xyz), times K with its principal point at (0, 0)
-        H[:, 0, 0], H[:, 0, 1], H[:, 0, 2] = radius * cy * cz, -radius * cy * sz, x
-        H[:, 1, 0], H[:, 1, 1], H[:, 1, 2] = radius * (cx * sz + sx * sy * cz), radius * (cx * cz - sx * sy * sz), y
-        H[:, 2, 0], H[:, 2, 1] = radius / focal * (sx * sz - cx * sy * cz), radius / focal * (sx * cz + cx * sy * sz)
-        H[:, 2, 2] = 1.0
-        H[:, 0] -= x[:, None] * H[:, 2]
-        H[:, 1] -= y[:, None] * H[:, 2]
-        _, major, minor = ellipses(H)
-        good = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
-        found.append(H[good][:missing])
-        missing -= len(found[-1])
-    return np.concatenate(found) if found else np.zeros((0, 3, 3))
-
-
-def _log(interval: tuple[float, float]) -> tuple[float, float]:
-    return float(np.log(interval[0])), float(np.log(interval[1]))
-
-
-def ellipses(H: Float) -> tuple[Float, Float, Float]:
-    """Centres (n, 2) and semi-axes (n,) of projected unit discs; nan where one reaches the horizon."""
-    dual = H @ np.diag([1.0, 1.0, -1.0]) @ H.transpose(0, 2, 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dual = np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan)
-        x, y = dual[:, 0, 2], dual[:, 1, 2]
-        xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
-        half, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
-        return np.column_stack([x, y]), np.sqrt(half + spread), np.sqrt(np.maximum(half - spread, 0.0))
-
-
 def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -> list[Disc]:
     """Choose the patches of one crop; draw the paper below them into the image, if there is any."""
     height, width = image.shape
@@ -364,12 +314,11 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -
     asked = int(rng.choice(5, p=(0.3, 0.32, 0.16, 0.13, 0.09)))
     if asked == 0:
         if on_board:
-            _paper(image, rng, random_poses(rng, 1, limits)[0] + _shift(rng.uniform(0, width), rng.uniform(0, height)))
+            _paper(image, rng, _poses(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    poses = random_poses(rng, 1 if on_board else asked, limits)
     # centres may lie a little outside: what remains of such a patch is no keypoint
-    at = rng.uniform(-0.1, 1.1, (len(poses), 2)) * (width, height) - 0.5
-    poses[:, :2] += at[:, :, None] * poses[:, 2:]
+    at = rng.uniform(-0.1, 1.1, (1 if on_board else asked, 2)) * (width, height) - 0.5
+    poses = _poses(rng, at, limits)
     if on_board:
         first = poses[0]
         _paper(image, rng, first)
@@ -393,7 +342,7 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -
         poses = first @ steps @ turns
         poses = poses[poses[:, 2, 2] > 0.2]
         poses /= poses[:, 2:, 2:]
-    centres, majors, minors = ellipses(poses)
+    centres, majors, minors, _ = projected_discs(poses)
     alike = rng.random() < 0.5
     which = rng.integers(len(patches), size=len(poses))
     black = rng.uniform(*limits.black, len(poses))
@@ -407,14 +356,18 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -
         patch = patches[which[n]]
         (x, y), reach = centres[n], patch.extent * majors[n]
         seen = -reach < x < width + reach and -reach < y < height + reach and majors[n] < 4 * width
-        apart = all(np.hypot(x - d.x, y - d.y) > reach + d.patch.extent * d.major for d in discs)
+        apart = all(np.hypot(x - d.x, y - d.y) > reach + d.placement.patch.extent * d.major for d in discs)
         if seen and apart:
-            discs.append(Disc(patch, int(which[n]), H, H[0, 2], H[1, 2], majors[n], minors[n], black[n], white[n]))
+            placement = Placement(patch, H, float(black[n]), float(white[n]))
+            discs.append(Disc(placement, int(which[n]), H[0, 2], H[1, 2], majors[n], minors[n]))
     return discs
 
 
-def _shift(x: float, y: float) -> Float:
-    return np.array([[0.0, 0.0, x], [0.0, 0.0, y], [0.0, 0.0, 0.0]])
+def _poses(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
+    """Poses as in a whole image, with their keypoints moved to given places (N, 2): the crop is cut around them."""
+    poses = random_poses(rng, len(at_px), *IMAGE_PX, limits)
+    poses[:, :2] += (at_px - poses[:, :2, 2])[:, :, None] * poses[:, 2:]
+    return poses
 
 
 def _paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
@@ -427,53 +380,10 @@ def _paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
         cv2.fillConvexPoly(image, np.round(points * 16).astype(np.int32), grey, cv2.LINE_AA, 4)
 
 
-def _distract(image: UInt8, rng: np.random.Generator) -> None:
-    """Draw what may be taken for a patch: discs, rings, half-discs, chequers, polygons, letters, bars."""
-    height, width = image.shape
-    for _ in range(rng.integers(1, 4)):
-        x, y = rng.uniform(0, 1, 2) * (width, height)
-        radius = np.exp(rng.uniform(np.log(4), np.log(40)))
-        dark, light = rng.uniform(0, 120), rng.uniform(150, 255)
-        if rng.random() < 0.5:
-            dark, light = light, dark
-        angle = rng.uniform(0, 360)
-        ratio = rng.uniform(0.4, 1.0)
-        centre = (int(x * 16), int(y * 16))
-        axes = (int(radius * 16), int(radius * ratio * 16))
-        kind = rng.integers(7)
-        if kind == 0:  # disc
-            cv2.ellipse(image, centre, axes, angle, 0, 360, dark, -1, cv2.LINE_AA, 4)
-        elif kind == 1:  # rings
-            for part in np.linspace(1, 0, rng.integers(2, 5), endpoint=False):
-                inner = (int(axes[0] * part), int(axes[1] * part))
-                cv2.ellipse(image, centre, inner, angle, 0, 360, dark, -1, cv2.LINE_AA, 4)
-                dark, light = light, dark
-        elif kind == 2:  # a disc of one edge: half black, half white
-            cv2.ellipse(image, centre, axes, angle, 0, 360, light, -1, cv2.LINE_AA, 4)
-            cv2.ellipse(image, centre, axes, angle, 0, 180, dark, -1, cv2.LINE_AA, 4)
-        elif kind == 3:  # chequers: their corners look like patches, but have neighbours
-            _chequers(image, rng, dark, light)
-        elif kind == 4:  # triangle or quadrangle
-            corner_angles = np.sort(rng.uniform(0, 2 * np.pi, rng.integers(3, 5)))
-            points = np.column_stack([x + radius * np.cos(corner_angles), y + radius * np.sin(corner_angles)])
-            cv2.fillPoly(image, [np.round(points * 16).astype(np.int32)], dark, cv2.LINE_AA, 4)
-        elif kind == 5:  # letters
-            text = "".join(chr(c) for c in rng.integers(48, 91, rng.integers(1, 5)))
-            size = float(radius / 20)
-            place = (int(x - radius), int(y + radius / 2))
-            cv2.putText(image, text, place, int(rng.integers(8)), size, dark, int(rng.integers(1, 4)), cv2.LINE_AA)
-        else:  # a bar or a line
-            c, s = radius * np.cos(np.radians(angle)), radius * np.sin(np.radians(angle))
-            thick = int(rng.integers(1, 8))
-            cv2.line(
-                image, (int(x - 3 * c), int(y - 3 * s)), (int(x + 3 * c), int(y + 3 * s)), dark, thick, cv2.LINE_AA
-            )
-
-
-def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc]) -> list[Disc]:
+def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
     """Put things over the patches; returns those of which more than a third is hidden."""
     before = image.copy()
-    _distract(image, rng)
+    draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)
     hidden = []
     for disc in discs:
@@ -484,60 +394,13 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc]) -> l
     return hidden
 
 
-def _chequers(image: UInt8, rng: np.random.Generator, dark: float, light: float) -> None:
-    rows, columns = rng.integers(3, 8, 2)
-    side = int(np.exp(rng.uniform(np.log(4), np.log(18))))
-    board = np.kron(np.indices((rows, columns)).sum(axis=0) % 2, np.ones((side, side)))
-    texture = np.where(board > 0, dark, light).astype(np.uint8)
-    angle = rng.uniform(0, 2 * np.pi)
-    A = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]) @ np.diag(
-        [1.0, rng.uniform(0.5, 1.0)]
-    )
-    shift = rng.uniform(0, 1, 2) * image.shape[::-1] - A @ (np.array(texture.shape[::-1]) / 2)
-    M = np.column_stack([A, shift])
-    size = (image.shape[1], image.shape[0])
-    mask = cv2.warpAffine(np.full_like(texture, 255), M, size, flags=cv2.INTER_LINEAR)
-    drawn = cv2.warpAffine(texture, M, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    np.copyto(image, drawn, where=mask > 127)
-
-
-@lru_cache(maxsize=64)
-def _stacked_polygons(patch: Patch, tolerance: float) -> tuple[Float, tuple[int, ...], int]:
-    """All vertices of (black, disc) in homogeneous coordinates, where to cut them, and the number of black ones."""
-    black, disc = unit_polygons(patch, tolerance)
-    points = np.concatenate([*black, *disc])
-    cuts = np.cumsum([len(p) for p in (*black, *disc)])[:-1]
-    return np.column_stack([points, np.ones(len(points))]), tuple(cuts.tolist()), len(black)
-
-
 def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
     """Draw the patches of a whole batch with one call of the rasteriser."""
-    regions: list[Sequence[Float]] = []
-    boxes: list[Box] = []
-    for disc in (d for row in discs for d in row):
-        # edges true to 1/64 px: cheaper than in a benchmark image, and still below what noise leaves
-        stacked, cuts, black_count = _stacked_polygons(disc.patch, 2.0 ** np.floor(np.log2(1 / 64 / disc.major)))
-        mapped = stacked @ disc.H_patch2image.T
-        polygons = np.split(mapped[:, :2] / mapped[:, 2:], cuts)
-        regions += [polygons[:black_count], polygons[black_count:]]
-        boxes += [box_around(polygons[black_count:])] * 2
-    covers = coverage(regions, boxes)
-    n = 0
-    for image, row in zip(canvases, discs, strict=True):
-        for disc in row:
-            _paint(image, boxes[n], covers[n], covers[n + 1], disc.black, disc.white)
-            n += 2
-
-
-def _paint(image: UInt8, box: Box, black_cover: Float, disc_cover: Float, black: float, white: float) -> None:
-    x, y, w, h = box
-    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
-    if x0 >= x1 or y0 >= y1:
-        return
-    here = slice(y0 - y, y1 - y), slice(x0 - x, x1 - x)
-    part = image[y0:y1, x0:x1]
-    disc = disc_cover[here]
-    part[:] = np.rint(part * (1.0 - disc) + white * disc - (white - black) * black_cover[here])
+    drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
+    # edges true to 1/64 px: cheaper than in a benchmark image, and still below what noise leaves
+    masks = rasterise([placement for _, placement in drawn], 1 / 64)
+    for (image, placement), mask in zip(drawn, masks, strict=True):
+        paint(image, mask, placement.black, placement.white)
 
 
 def _degrade(

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.design import Patch, unit_polygons
-from kpbench.geometry import Camera, Ellipse, plane_to_camera, project, projected_disc, rotation_xyz
+from kpbench.geometry import projected_discs
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
-from kpbench.raster import Box, box_around, coverage
+from kpbench.raster import Box, box_around, edge_coverage
 
-__all__ = ["Limits", "Placement", "Rendered", "measure_contrast", "random_placements", "render_scene", "stream"]
+__all__ = [
+    "Limits",
+    "Mask",
+    "Placement",
+    "Rendered",
+    "measure_contrast",
+    "paint",
+    "random_placements",
+    "random_poses",
+    "rasterise",
+    "render_scene",
+    "stream",
+]
 
 
 @dataclass(frozen=True)
@@ -85,42 +99,102 @@ def random_placements(
     """
     placements: list[Placement] = []
     taken: list[tuple[float, float, float]] = []
-    for _ in range(rng.integers(limits.count[0], limits.count[1] + 1)):
-        patch = patches[int(rng.integers(len(patches)))]
-        for _attempt in range(50):
-            H = _random_pose(rng, width_px, height_px, limits)
-            grown = projected_disc(H @ np.diag([patch.extent, patch.extent, 1.0]))
-            if all(np.hypot(grown.x - x, grown.y - y) > grown.major + r + 2 for x, y, r in taken):
-                taken.append((grown.x, grown.y, grown.major))
-                placements.append(Placement(patch, H, rng.uniform(*limits.black), rng.uniform(*limits.white)))
-                break
+    count = int(rng.integers(limits.count[0], limits.count[1] + 1))
+    for _ in range(25):  # mostly one is enough
+        if len(placements) == count:
+            break
+        tried = 2 * (count - len(placements)) + 2
+        poses = random_poses(rng, tried, width_px, height_px, limits)
+        chosen = rng.integers(len(patches), size=tried)
+        black, white = rng.uniform(*limits.black, tried), rng.uniform(*limits.white, tried)
+        extent = np.array([patch.extent for patch in patches])[chosen]
+        centre, reach, _, _ = projected_discs(poses * np.stack([extent, extent, np.ones(tried)], axis=1)[:, None])
+        for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
+            apart = all(math.hypot(x - x0, y - y0) > r + r0 + 2 for x0, y0, r0 in taken)
+            if len(placements) < count and apart:
+                taken.append((x, y, r))
+                placements.append(Placement(patches[chosen[n]], poses[n], float(black[n]), float(white[n])))
     return placements
 
 
-def _random_pose(rng: np.random.Generator, width_px: int, height_px: int, limits: Limits) -> Float:
-    """H_patch2image with H[2, 2] = 1, hence the keypoint at (H[0, 2], H[1, 2])."""
-    while True:
-        focal_px = width_px * np.exp(rng.uniform(*np.log(limits.focal)))
-        K = Camera(width_px, height_px, focal_px).K
-        x_deg, y_deg = rng.uniform(-limits.tilt_deg, limits.tilt_deg, 2)
-        R = rotation_xyz(x_deg, y_deg, rng.uniform(0, 360))
-        depth = focal_px / np.exp(rng.uniform(*np.log(limits.radius_px)))  # in disc radii
-        x, y = rng.uniform(0, width_px - 1), rng.uniform(0, height_px - 1)
-        t = depth * np.array([(x - K[0, 2]) / focal_px, (y - K[1, 2]) / focal_px, 1.0])
-        H = K @ plane_to_camera(R, t) / depth
-        if np.hypot(H[2, 0], H[2, 1]) > 0.5:  # so near, as in tiny images, that its depth varies by half or more
-            continue
-        ellipse = projected_disc(H)
-        if 2 * ellipse.minor >= limits.minor_axis_px and _axis_difference(ellipse) <= limits.axis_difference:
-            return np.asarray(H)
+def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px: int, limits: Limits) -> Float:
+    """Poses of single patches that keep the limits, keypoints anywhere in the image.
+
+    Returns
+    -------
+    ndarray of shape (count, 3, 3)
+        H_patch2image with H[:, 2, 2] = 1, hence the keypoints at (H[:, 0, 2], H[:, 1, 2]).
+    """
+    found = [np.zeros((0, 3, 3))]
+    missing = count
+    while missing > 0:
+        n = 2 * missing + 4
+        focal_px, radius_px = width_px * _log_uniform(rng, limits.focal, n), _log_uniform(rng, limits.radius_px, n)
+        tilt = np.radians(rng.uniform(-limits.tilt_deg, limits.tilt_deg, (2, n)))
+        turn = rng.uniform(0, 2 * np.pi, n)
+        x, y = rng.uniform(0, 1, (2, n)) * np.array([[width_px - 1], [height_px - 1]])
+        (cx, cy), (sx, sy), cz, sz = np.cos(tilt), np.sin(tilt), np.cos(turn), np.sin(turn)
+        # K [r1 r2 t] / depth at the depth focal / radius, in disc radii; r1 and r2 of geometry.rotation_xyz
+        H = np.empty((n, 3, 3))
+        H[:, 0, 0], H[:, 0, 1] = radius_px * cy * cz, -radius_px * cy * sz
+        H[:, 1, 0], H[:, 1, 1] = radius_px * (cx * sz + sx * sy * cz), radius_px * (cx * cz - sx * sy * sz)
+        H[:, 2, 0] = radius_px / focal_px * (sx * sz - cx * sy * cz)
+        H[:, 2, 1] = radius_px / focal_px * (sx * cz + cx * sy * sz)
+        H[:, 0, :2] += (width_px - 1) / 2 * H[:, 2, :2]
+        H[:, 1, :2] += (height_px - 1) / 2 * H[:, 2, :2]
+        H[:, 0, 2], H[:, 1, 2], H[:, 2, 2] = x, y, 1.0
+        _, major, minor, _ = projected_discs(H)
+        good = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
+        # none so near, as in tiny images, that its depth varies by half or more
+        found.append(H[good & (np.hypot(H[:, 2, 0], H[:, 2, 1]) <= 0.5)][:missing])
+        missing -= len(found[-1])
+    return np.concatenate(found)
 
 
-def _axis_difference(ellipse: Ellipse) -> float:
-    return (ellipse.major - ellipse.minor) / ellipse.major
+def _log_uniform(rng: np.random.Generator, span: tuple[float, float], count: int) -> Float:
+    return np.exp(rng.uniform(np.log(span[0]), np.log(span[1]), count))
+
+
+@lru_cache(maxsize=256)
+def _edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64], int, int]:
+    """Vertices of (black, disc), shape (3, N) with ones below, the place of each one's successor, and both counts."""
+    black, disc = unit_polygons(patch, tolerance)
+    sizes = [len(polygon) for polygon in (*black, *disc)]
+    following = np.concatenate([np.roll(np.arange(n), -1) + sum(sizes[:k]) for k, n in enumerate(sizes)])
+    points = np.concatenate([*black, *disc])
+    inner = sum(map(len, black))
+    return np.vstack([points.T, np.ones(len(points))]), following, inner, len(points) - inner
+
+
+def rasterise(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> list[Mask]:
+    """Exact area coverage of patches, of any number of images at once.
+
+    Parameters
+    ----------
+    placements : sequence of Placement
+    tolerance_px : largest distance between a drawn edge and the true one; half of it at least is used.
+    """
+    if not placements:
+        return []
+    poses = np.stack([p.H_patch2image for p in placements])
+    _, major, _, _ = projected_discs(poses)
+    starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
+    # rounded to a power of two, so that polygons are reused
+    for p, tolerance in zip(placements, 2.0 ** np.floor(np.log2(tolerance_px / major)), strict=True):
+        vertices, following, black, disc = _edges(p.patch, float(tolerance))
+        mapped = p.H_patch2image @ vertices
+        points = mapped[:2] / mapped[2]
+        starts.append(points)
+        ends.append(points[:, following])
+        counts += [black, disc]
+        boxes += [box_around([points[:, black:].T])] * 2
+    owner = np.repeat(np.arange(len(counts)), counts)
+    covers = edge_coverage(np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), owner, boxes)
+    return [Mask(boxes[n], covers[n], covers[n + 1]) for n in range(0, len(covers), 2)]
 
 
 def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendered:
-    """Draw patches onto a background with exact area coverage.
+    """Draw patches onto a background with exact area coverage, edges true to 1/1000 px.
 
     Parameters
     ----------
@@ -130,33 +204,19 @@ def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendered
     Returns
     -------
     Rendered
-        ``keypoints["contrast"]`` is that of the clean image, see :func:`measure_contrast`.
+        ``keypoints["contrast"]`` is nan, see :func:`measure_contrast`.
     """
     image = background.copy()
     keypoints = np.zeros(len(placements), KEYPOINT_DTYPE)
-    ellipses = [projected_disc(p.H_patch2image) for p in placements]
-    regions: list[list[Float]] = []
-    boxes: list[Box] = []
-    for placement, ellipse in zip(placements, ellipses, strict=True):
-        # edges true to 1/1000 px; the tolerance is rounded to a power of two so that polygons are reused
-        tolerance = 2.0 ** np.floor(np.log2(1e-3 / ellipse.major))
-        black, disc = unit_polygons(placement.patch, tolerance)
-        H = placement.H_patch2image
-        projected = [[project(H, p) for p in black], [project(H, p) for p in disc]]
-        regions += projected
-        boxes += [box_around(projected[1])] * 2
-    covers = coverage(regions, boxes)
-    masks = []
-    for n, (placement, ellipse) in enumerate(zip(placements, ellipses, strict=True)):
-        mask = Mask(boxes[2 * n], covers[2 * n], covers[2 * n + 1])
-        masks.append(mask)
-        visible = _paint(image, mask, placement.black, placement.white)
-        x, y = project(placement.H_patch2image, [[0.0, 0.0]])[0]
-        axes = (ellipse.major, ellipse.minor, ellipse.angle_deg)
-        keypoints[n] = (x, y, placement.patch.patch_id, *axes, placement.H_patch2image, visible, 0.0)
-    rendered = Rendered(image, keypoints, tuple(masks))
-    keypoints["contrast"] = measure_contrast(image, masks)
-    return rendered
+    masks = rasterise(placements)
+    if placements:
+        H = keypoints["H_patch2image"] = np.stack([p.H_patch2image for p in placements])
+        _, keypoints["radius_major"], keypoints["radius_minor"], keypoints["axis_angle"] = projected_discs(H)
+        keypoints["x"], keypoints["y"] = H[:, 0, 2] / H[:, 2, 2], H[:, 1, 2] / H[:, 2, 2]
+        keypoints["patch_id"] = [p.patch.patch_id for p in placements]
+        keypoints["visible"] = [paint(image, m, p.black, p.white) for m, p in zip(masks, placements, strict=True)]
+    keypoints["contrast"] = np.nan
+    return Rendered(image, keypoints, tuple(masks))
 
 
 def inside_image(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -167,15 +227,17 @@ def inside_image(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[sli
     return (slice(y0, y1), slice(x0, x1)), (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
 
 
-def _paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
+def paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
     """Draw one patch in place; return the fraction of it that lies in the image."""
     there, here = inside_image(mask.box, image)
     disc = mask.disc[here]
+    if not disc.size:
+        return 0.0
     ink = white * disc - (white - black) * mask.black[here]
     below = 1.0 - disc
     if image.ndim == 3:
         ink, below = ink[..., None], below[..., None]
-    image[there] = np.rint(image[there] * below + ink).astype(np.uint8)
+    image[there] = np.rint(image[there] * below + ink)
     return float(disc.sum() / mask.disc.sum())
 
 
@@ -189,10 +251,13 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     contrast = np.full(len(masks), np.nan)
     for n, mask in enumerate(masks):
         there, here = inside_image(mask.box, image)
-        grey = image[there] if image.ndim == 2 else image[there].mean(axis=2)
-        inside = mask.disc[here] > 1 - 1e-6
-        share, grey = mask.black[here][inside], grey[inside].astype(np.float64)
-        if share.size and np.ptp(share) > 1e-3:
-            centred = share - share.mean()
-            contrast[n] = -(centred @ grey) / (centred @ centred)
+        part = image[there]
+        grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
+        share = mask.black[here].ravel()
+        inside = (mask.disc[here].ravel() > 1 - 1e-6).astype(np.float64)  # as weights, which is quicker than picking
+        count = inside.sum()
+        weighted = inside * share
+        # sums, not @: a threaded BLAS costs more than it gives here
+        if count and (variation := (weighted * share).sum() - weighted.sum() ** 2 / count) > 1e-6 * count:
+            contrast[n] = (weighted.sum() * (inside * grey).sum() / count - (weighted * grey).sum()) / variation
     return contrast

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
 import os
 import tempfile
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import deflate
 import h5py
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +30,8 @@ __all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_atomic", 
 
 SCHEMA = "kpbench.dataset/1"
 MANIFEST = "dataset.json"
-DEFLATE_LEVEL = 1  # ISA-L is eight times as fast, but its output was seen to depend on what a process compressed before
+# libdeflate: the output of ISA-L, zlib-ng and zlib-rs may depend on what else was in memory (docs/dataset.md)
+DEFLATE_LEVEL = 1
 COLUMNS = (
     "images",
     "image_id",
@@ -67,7 +69,7 @@ def canonical_json(content: object) -> str:
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
-def write_atomic(path: Path, data: bytes) -> None:
+def write_atomic(path: Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all: temporary sibling, fsync, rename, fsync of the folder.
 
     Raises
@@ -99,38 +101,38 @@ def write_atomic(path: Path, data: bytes) -> None:
         raise DataError(f"{path}: cannot be written, {why}") from None
 
 
-def encode_shard(samples: Sequence[Sample], config: Mapping[str, Any], broken: Sequence[str] = ()) -> bytes:
+def encode_shard(
+    samples: Iterable[Sample], count: int, config: Mapping[str, Any], broken: Collection[str] = ()
+) -> memoryview:
     """All bytes of a shard's HDF5 file, built in memory: the same samples give the same bytes.
 
-    ``broken`` lists the background files that could not be decoded on the way.
+    Images are packed as they come, so that never more than one is held unpacked.
+
+    Parameters
+    ----------
+    samples : iterable of Sample
+    count : how many there are.
+    config : the dataset's config.
+    broken : background files that could not be decoded on the way; looked at when all samples are in.
 
     Raises
     ------
     ValueError
         If there are no samples or their images differ in shape.
     """
-    shapes = {sample.image.shape for sample in samples}
-    if len(shapes) != 1:
-        raise ValueError(f"a shard needs images of one shape, got {sorted(shapes)}")
-    shape = shapes.pop()
-    counts = [len(sample.keypoints) for sample in samples]
+    buffer = io.BytesIO()
     # v110 file structures carry checksums, so that a flipped byte outside the data is seen on reading. Only the
     # heap of variable-length strings has none (and HDF5 can loop for ever over a damaged one): text is of fixed length
-    with h5py.File.in_memory(libver=("v110", "v110")) as file:
+    with h5py.File(buffer, "w", libver=("v110", "v110")) as file:
+        kept = _write_images(file, samples, count)
         attributes = {
             "schema": SCHEMA,
             "config": canonical_json(config),
-            "broken_backgrounds": canonical_json(list(broken)),
+            "broken_backgrounds": canonical_json(sorted(broken)),
         }
         for name, text in attributes.items():
             file.attrs.create(name, text.encode(), dtype=_text_type([text.encode()]))
         file.attrs["version"] = 1
-        images = file.create_dataset(
-            "images", (len(samples), *shape), "u1", chunks=(1, *shape), compression="gzip", compression_opts=1
-        )
-        for n, sample in enumerate(samples):
-            packed = zlib.compress(sample.image.tobytes(), DEFLATE_LEVEL)
-            images.id.write_direct_chunk((n, *(0 for _ in shape)), packed)
 
         def column(name: str, values: NDArray[Any], **compression: Any) -> None:
             checked = {"chunks": values.shape, "fletcher32": True, **compression} if values.size else {}
@@ -139,16 +141,34 @@ def encode_shard(samples: Sequence[Sample], config: Mapping[str, Any], broken: S
         def texts(name: str, values: Sequence[str]) -> None:
             column(name, _fixed_text(values), compression="gzip", compression_opts=1)
 
-        column("image_id", np.array([sample.image_id for sample in samples], "<i8"))
-        column("scene_id", np.array([_scene(sample) for sample in samples], "<i8"))
-        texts("condition", [sample.condition for sample in samples])
-        column("rung", np.array([sample.rung for sample in samples], "<f8"))
-        column("offsets", np.concatenate([[0], np.cumsum(counts)]).astype("<i8"))
-        column("keypoints", np.concatenate([sample.keypoints for sample in samples]).astype(KEYPOINT_DTYPE))
-        texts("degradations", [canonical_json(sample.effects) for sample in samples])
-        texts("background", [sample.background for sample in samples])
-        file.flush()
-        return bytes(file.id.get_file_image())
+        column("image_id", np.array([sample.image_id for sample in kept], "<i8"))
+        column("scene_id", np.array([_scene(sample) for sample in kept], "<i8"))
+        texts("condition", [sample.condition for sample in kept])
+        column("rung", np.array([sample.rung for sample in kept], "<f8"))
+        column("offsets", np.cumsum([0, *(len(sample.keypoints) for sample in kept)], dtype="<i8"))
+        column("keypoints", np.concatenate([sample.keypoints for sample in kept]).astype(KEYPOINT_DTYPE))
+        texts("degradations", [canonical_json(sample.effects) for sample in kept])
+        texts("background", [sample.background for sample in kept])
+    return buffer.getbuffer()
+
+
+def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Sample]:
+    """Write ``/images``, one a chunk; return the samples without their pixels."""
+    kept: list[Sample] = []
+    shape: tuple[int, ...] = ()
+    for sample in samples:
+        if not kept:
+            shape = sample.image.shape
+            whole = {"chunks": (1, *shape), "compression": "gzip", "compression_opts": DEFLATE_LEVEL}
+            images = file.create_dataset("images", (count, *shape), "u1", **whole)
+        elif sample.image.shape != shape:
+            raise ValueError(f"a shard needs images of one shape, got {shape} and {sample.image.shape}")
+        packed = deflate.zlib_compress(np.ascontiguousarray(sample.image), DEFLATE_LEVEL)
+        images.id.write_direct_chunk((len(kept), *(0 for _ in shape)), packed)
+        kept.append(replace(sample, image=sample.image[:0]))
+    if len(kept) != count or not count:
+        raise ValueError(f"a shard of {count} images got {len(kept)}")
+    return kept
 
 
 def _text_type(packed: Sequence[bytes]) -> Any:
@@ -193,7 +213,7 @@ def write_manifest(
         "fingerprint": mark,
         "seed": config.get("seed"),
         "images": sum(shard.count for shard in shards),
-        "config": dict(config),
+        "config": json.loads(canonical_json(config)),  # in one order of keys
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }

@@ -13,12 +13,13 @@ from kpbench import degrade
 from kpbench.background import Background, PhotoFolder, procedural
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError
+from kpbench.lookalikes import draw_lookalikes
 from kpbench.scene import Limits, measure_contrast, random_placements, render_scene, stream
 from kpbench.store import Sample
 
 __all__ = ["SynthConfig"]
 
-BACKGROUND, SCENE, DETERIORATION = range(3)
+BACKGROUND, SCENE, DETERIORATION, LOOKALIKES = range(4)
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class SynthConfig:
     deteriorate : "none" or "paper" (:func:`kpbench.degrade.paper_mix`); the scenes are the same.
     shard_size : images a shard; changes the files but no image.
     backgrounds : folder of photographs, or None for procedural ones.
+    distractors : look-alikes an image (:mod:`kpbench.lookalikes`), up to so many; the scenes are the same.
     limits : what a scene may hold.
     patches : the designs to place.
 
@@ -50,6 +52,7 @@ class SynthConfig:
     deteriorate: str = "paper"
     shard_size: int = 500
     backgrounds: Path | None = None
+    distractors: int = 0
     limits: Limits = field(default_factory=Limits)
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
 
@@ -64,6 +67,7 @@ class SynthConfig:
         need(max(self.size_px) <= 16384, f"--size is {self.size_px[0]}x{self.size_px[1]}, at most 16384 a side")
         need(self.channels in (1, 3), f"--channels is {self.channels}, expected 1 or 3")
         need(self.deteriorate in ("none", "paper"), f"--deteriorate is {self.deteriorate!r}, expected none or paper")
+        need(0 <= self.distractors <= 1000, f"--distractors is {self.distractors}, expected a number from 0 to 1000")
         need(self.shard_size >= 1, f"--shard-size is {self.shard_size}, expected a number of images from 1")
 
     @cached_property
@@ -86,6 +90,7 @@ class SynthConfig:
             "deteriorate": self.deteriorate,
             "shard_size": self.shard_size,
             "backgrounds": source,
+            "distractors": self.distractors,
             "limits": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.limits).items()},
             "patches": [patch.to_dict() for patch in self.patches],
         }
@@ -107,12 +112,15 @@ class SynthConfig:
         """
         width, height = self.size_px
         background = self._background(stream(self.seed, index, BACKGROUND))
+        if self.distractors:
+            rng = stream(self.seed, index, LOOKALIKES)
+            draw_lookalikes(background.image, rng, int(rng.integers(self.distractors + 1)), self.patches)
         placements = random_placements(stream(self.seed, index, SCENE), width, height, self.patches, self.limits)
         scene = render_scene(background.image, placements)
         image, effects = scene.image, list[dict[str, Any]]()
         if self.deteriorate == "paper":
             image, effects = degrade.paper_mix(image, stream(self.seed, index, DETERIORATION))
-            scene.keypoints["contrast"] = measure_contrast(image, scene.masks)
+        scene.keypoints["contrast"] = measure_contrast(image, scene.masks)
         return Sample(index, image, scene.keypoints, effects, background.file), background.broken
 
     def _background(self, rng: np.random.Generator) -> Background:

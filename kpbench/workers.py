@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import cv2
 
 from kpbench.errors import DataError
 
-__all__ = ["Progress", "cores", "run_pieces"]
+__all__ = ["Progress", "cores", "dask_executor", "run_pieces"]
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -29,7 +39,11 @@ def cores() -> int:
 
 
 def run_pieces(
-    work: Callable[[Piece, Progress], Result], pieces: Sequence[Piece], workers: int | None, progress: Progress
+    work: Callable[[Piece, Progress], Result],
+    pieces: Sequence[Piece],
+    workers: int | None,
+    progress: Progress,
+    executor: Executor | None = None,
 ) -> Iterator[Result]:
     """Yield ``work(piece, progress)`` of every piece as it is finished, in any order.
 
@@ -39,6 +53,7 @@ def run_pieces(
     pieces : sequence
     workers : processes; None for one a core. 1 works in this process.
     progress : called in this process.
+    executor : any executor to work in instead; ``progress`` is then called piece by piece.
 
     Raises
     ------
@@ -46,42 +61,100 @@ def run_pieces(
         If a worker process dies.
     """
     workers = min(workers or cores(), len(pieces))
-    if workers <= 1:
+    if executor is not None:
+        futures = [executor.submit(_alone, work, piece) for piece in pieces]
+        try:
+            for result, images in _finished(futures, lambda: None):
+                progress(images)
+                yield result
+        finally:
+            for future in futures:
+                future.cancel()
+    elif workers <= 1:
         cv2.setNumThreads(1)
         for piece in pieces:
             yield work(piece, progress)
-        return
+    else:
+        yield from _in_processes(work, pieces, workers, progress)
+
+
+def _in_processes(
+    work: Callable[[Piece, Progress], Result], pieces: Sequence[Piece], workers: int, progress: Progress
+) -> Iterator[Result]:
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV or HDF5 may hang
     counter = spawn.Value("q", 0)
     pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
+    seen = 0
+
+    def tell() -> None:
+        nonlocal seen
+        now = counter.value
+        progress(now - seen)
+        seen = now
+
     try:
-        waiting: set[Future[Result]] = {pool.submit(_in_worker, work, piece) for piece in pieces}
-        seen = 0
-        while waiting:
-            done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-            now = counter.value
-            progress(now - seen)
-            seen = now
-            for future in done:
-                yield future.result()
-    except BrokenProcessPool:
-        raise DataError("a worker process died (out of memory?)") from None
+        yield from _finished([pool.submit(_in_worker, work, piece) for piece in pieces], tell)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.terminate()
 
 
+def _finished(futures: Sequence[Future[Result]], tick: Callable[[], None]) -> Iterator[Result]:
+    """Results as they come; ``tick`` is called at least every fifth of a second."""
+    waiting = set(futures)
+    try:
+        while waiting:
+            done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
+            tick()
+            for future in done:
+                yield future.result()
+    except BrokenExecutor:
+        raise DataError("a worker process died (out of memory?)") from None
+
+
+@contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """An executor on the workers of a Dask scheduler; a piece whose worker dies is given to another one.
+
+    Raises
+    ------
+    DataError
+        If ``distributed`` is not installed or the scheduler does not answer.
+    """
+    try:
+        distributed: Any = importlib.import_module("distributed")
+    except ImportError:
+        raise DataError("Dask is not installed: pip install 'kpbench[dask]'") from None
+    try:
+        client = distributed.Client(address, timeout=10)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{address}: no Dask scheduler answers ({type(error).__name__})") from None
+    with client:
+        try:
+            yield client.get_executor(pure=False, retries=2)
+        except (distributed.KilledWorker, CancelledError):
+            raise DataError(f"{address}: its workers died; finished shards are kept, add --resume to go on") from None
+
+
 _counter: Any = None
 
 
 def _start_worker(counter: Any) -> None:
-    """Runs once in each worker: one thread, and Ctrl-C is the parent's business."""
+    """Runs once in each worker: one thread, Ctrl-C is the parent's business, and an orphan ends."""
     global _counter
     _counter = counter
     cv2.setNumThreads(1)
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _count(images: int) -> None:
@@ -91,3 +164,15 @@ def _count(images: int) -> None:
 
 def _in_worker(work: Callable[[Piece, Progress], Result], piece: Piece) -> Result:
     return work(piece, _count)
+
+
+def _alone(work: Callable[[Piece, Progress], Result], piece: Piece) -> tuple[Result, int]:
+    """A piece's result and its number of images, where no counter is shared."""
+    cv2.setNumThreads(1)
+    images = 0
+
+    def count(more: int) -> None:
+        nonlocal images
+        images += more
+
+    return work(piece, count), images

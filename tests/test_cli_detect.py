@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.design import load_patches
-from kpbench.pipeline import generate
+from kpbench.generation import generate
 from kpbench.predictions import read_predictions
 from kpbench.scene import Limits
 from kpbench.synth import SynthConfig

@@ -29,7 +29,7 @@ def write_dataset(folder, images, condition="", seed=0):
         samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
     config = {"seed": seed}
     path = folder / "shard-00000.h5"
-    write_atomic(path, encode_shard(samples, config))
+    write_atomic(path, encode_shard(samples, len(samples), config))
     write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
     return open_dataset(folder)
 

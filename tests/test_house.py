@@ -16,7 +16,7 @@ LAYERS = [
     {"errors", "keypoints"},
     {"files", "geometry", "outline", "raster", "workers"},
     {"design"},
-    {"background", "board", "cells", "draw", "sidecar", "tiling"},
+    {"background", "board", "cells", "draw", "lookalikes", "sidecar", "tiling"},
     {"tags"},
     {"sheet", "analysis", "search", "design_figure"},
     {"scene", "degrade"},
@@ -35,6 +35,7 @@ LAYERS = [
     {"breakpoints", "charts", "comparison", "gallery", "paper", "preview", "tables"},
     {"exhibits", "interchange"},
     {"report"},
+    {"generation"},
     {"pipeline"},
     {"bench"},
 ]
@@ -45,7 +46,7 @@ EVALUATOR = {
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
-    *("background", "tags", "scene", "degrade", "camera", "synth", "suite", "samples"),
+    *("background", "lookalikes", "tags", "scene", "degrade", "camera", "synth", "suite", "samples"),
 }
 TORCH = {"network", "train", "export"}
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError
+from kpbench.generation import generate
 from kpbench.interchange import export_dataset
-from kpbench.pipeline import generate
 from kpbench.synth import SynthConfig
 
 

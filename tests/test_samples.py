@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from kpbench import samples
 from kpbench.design import shipped_patches
 from kpbench.geometry import projected_disc
-from kpbench.samples import Job, SampleConfig, load_photos, make_batch, random_poses, stream
-from kpbench.scene import Limits
+from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
+from kpbench.scene import Limits, Placement
 
 PATCHES = shipped_patches()
 CROPS = SampleConfig(size=(96, 96))
@@ -58,7 +58,7 @@ def test_what_is_drawn_is_the_design_about_the_keypoint():
     """Ink at points of the patch, looked up through the pose, against the pixels of the crop."""
     canvas = np.full((96, 96), 128, np.uint8)
     H = np.array([[30.0, -4.0, 40.3], [6.0, 22.0, 50.8], [0.05, -0.08, 1.0]])
-    disc = samples.Disc(PATCHES[3], 3, H, H[0, 2], H[1, 2], 32.0, 20.0, 10.0, 240.0)
+    disc = samples.Disc(Placement(PATCHES[3], H, 10.0, 240.0), 3, H[0, 2], H[1, 2], 32.0, 20.0)
     samples._paint_all([canvas], [[disc]])
     v, u = np.mgrid[-20:21, -20:21] / 21.0
     points = np.column_stack([u.ravel(), v.ravel()])[np.hypot(u, v).ravel() < 0.9]
@@ -71,23 +71,13 @@ def test_what_is_drawn_is_the_design_about_the_keypoint():
 
 
 @given(st.integers(0, 2**31))
-def test_poses_keep_the_papers_limits(seed):
-    limits = Limits()
-    for H in random_poses(np.random.default_rng(seed), 5, limits):
-        assert H[:, 2] == pytest.approx([0, 0, 1], abs=1e-9)
+def test_poses_keep_the_papers_limits_wherever_they_are_put(seed):
+    limits, at = Limits(), np.array([[-4.0, 90.0], [30.0, 31.0]])
+    for H, place in zip(samples._poses(np.random.default_rng(seed), at, limits), at, strict=True):
+        assert H[:, 2] == pytest.approx([*place, 1], abs=1e-9)
         ellipse = projected_disc(H)
         assert 2 * ellipse.minor >= limits.minor_axis_px - 1e-6
         assert (ellipse.major - ellipse.minor) / ellipse.major <= limits.axis_difference + 1e-9
-
-
-def test_ellipses_are_those_of_the_geometry():
-    poses = random_poses(np.random.default_rng(0), 6, Limits())
-    centres, majors, minors = samples.ellipses(poses)
-    for n, H in enumerate(poses):
-        one = projected_disc(H)
-        assert (*centres[n], majors[n], minors[n]) == pytest.approx(
-            (one.x, one.y, one.major, one.minor), rel=1e-6, abs=1e-6
-        )
 
 
 def test_buried_keypoints_are_ignored_and_clean_ones_are_not(monkeypatch):

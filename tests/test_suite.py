@@ -13,7 +13,7 @@ from kpbench import degrade, store
 from kpbench.background import procedural
 from kpbench.cli import main
 from kpbench.errors import DataError
-from kpbench.pipeline import generate
+from kpbench.generation import generate
 from kpbench.suite import SuiteConfig, load_suite, shipped_suites
 
 SMALL = (203, 155)
@@ -82,7 +82,7 @@ def test_noise_of_one_scene_is_one_field_scaled():
     made = config(only=("noise",), images=1)
     base = config(only=("pitch",), images=1).make(0)[0].image.astype(int)
     weak, strong = (made.make(n)[0].image.astype(int) - base for n in (0, 4))
-    middle = (base > 100) & (base < 150)
+    middle = (base > 100) & (base < 150) & (abs(strong) < 100)  # none of it clipped
     assert abs(2 * weak - strong)[middle].max() <= 2  # rounding
 
 

@@ -16,6 +16,7 @@ COMMANDS = {
     "render-patches": ("patches:render_patches", "Print the patches or a board, true to scale."),
     "analyze-patches": ("analysis:analyze_patches", "Measure designs: localisation, confusion, look-alikes."),
     "synth": ("data:synth", "Write a synthetic labelled dataset."),
+    "merge": ("data:merge", "Make one dataset of shards made in parts."),
     "suite": ("suites:suite", "Write the images of a benchmark suite: paper-v1, extended-v1."),
     "degrade": ("suites:degrade", "Blur, dim, wet, ... images of your own."),
     "inspect": ("data:inspect", "Say what is in a dataset."),

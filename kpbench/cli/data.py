@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from kpbench.cli.options import PATCHES, SEED, SIZE, WORKERS
+from kpbench.cli.options import PATCHES, SEED, SIZE, run_options
 
-__all__ = ["export", "inspect", "preview", "synth", "verify"]
+__all__ = ["export", "inspect", "merge", "preview", "synth", "verify"]
 
 DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
 
@@ -22,10 +23,15 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @click.option("--size", type=SIZE, default="640x480", show_default=True)
 @click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
 @click.option("--deteriorate", type=click.Choice(["none", "paper"]), default="paper", show_default=True)
+@click.option(
+    "--distractors",
+    type=click.IntRange(0, 1000),
+    default=0,
+    show_default=True,
+    help="Up to so many look-alikes an image, without a label: discs, rings, half-patches, chequers, text.",
+)
 @click.option("--shard-size", type=int, default=500, show_default=True, help="Images a file.")
-@WORKERS
-@click.option("--resume", is_flag=True, help="Finish an interrupted run.")
-@click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
+@run_options
 def synth(
     n: int,
     out: Path,
@@ -35,10 +41,9 @@ def synth(
     size: tuple[int, int],
     channels: int,
     deteriorate: str,
+    distractors: int,
     shard_size: int,
-    workers: int | None,
-    resume: bool,
-    overwrite: bool,
+    **run: Any,
 ) -> None:
     """Write N synthetic labelled images into a dataset folder.
 
@@ -46,6 +51,7 @@ def synth(
     Examples:
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
       kpbench synth --n 500 --patches mine.toml --patches other.toml --out own-designs
+      kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
     from kpbench.cli.progress import write_dataset
     from kpbench.design import load_patches, shipped_patches
@@ -59,9 +65,30 @@ def synth(
         deteriorate=deteriorate,
         shard_size=shard_size,
         backgrounds=backgrounds,
+        distractors=distractors,
         patches=load_patches(patches) if patches else shipped_patches(),
     )
-    write_dataset(config, out, workers, resume, overwrite, "synth")
+    write_dataset(config, out, "synth", **run)
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("parts", nargs=-1, type=click.Path(path_type=Path))
+def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
+    """Make one dataset of shards that --shard-range made: check that all are there, write the manifest.
+
+    PARTS are folders whose shards are linked or copied into DATASET; none where all parts wrote into it.
+
+    \b
+    Examples:
+      kpbench synth --n 20000 --shard-range 0:20 --out train     # on one machine
+      kpbench synth --n 20000 --shard-range 20:40 --out train    # on another, same shared folder
+      kpbench merge train
+    """
+    from kpbench.cli.progress import tell_dataset
+    from kpbench.generation import merge as merged
+
+    tell_dataset(merged(dataset, parts))
 
 
 @click.command()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import click
 
-__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size"]
+__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size", "run_options"]
 
 
 class Size(click.ParamType[tuple[int, int]]):
@@ -45,6 +46,19 @@ class Finite(click.FloatRange):
         return number
 
 
+class Span(click.ParamType[range]):
+    """``A:B`` as a range."""
+
+    name = "A:B"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
+        try:
+            first, last = (int(part) for part in str(value).split(":"))
+        except ValueError:
+            self.fail(f"{value!r} is no range, expected A:B such as 0:10", param, ctx)
+        return range(first, last)
+
+
 SIZE = Size()
 FINITE = Finite()
 ONLY = click.option("--only", type=Names(), default="", help="Only these conditions, such as scale,blur.")
@@ -57,3 +71,17 @@ PATCHES = click.option(
     metavar="FILE|DIR",
     help="Your own design (TOML), or a folder of them; repeatable. Default: the shipped four.",
 )
+
+
+def run_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options of every command that writes a dataset: how, and what to do with what is there."""
+    for option in reversed((
+        WORKERS,
+        click.option("--engine", type=click.Choice(["local", "dask"]), default="local", show_default=True),
+        click.option("--scheduler", metavar="ADDR", help="Of Dask, such as tcp://host:8786."),
+        click.option("--shard-range", type=Span(), help="Only these shards, from 0; put together by kpbench merge."),
+        click.option("--resume", is_flag=True, help="Finish an interrupted run."),
+        click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder."),
+    )):  # fmt: skip
+        command = option(command)
+    return command

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from typing import Any
 
 import click
 
-from kpbench.pipeline import Recipe, generate
-from kpbench.workers import Progress
+from kpbench.generation import Recipe, generate, generate_part
+from kpbench.store import Dataset
+from kpbench.workers import Progress, dask_executor
 
-__all__ = ["progress_bar", "write_dataset"]
+__all__ = ["progress_bar", "tell_dataset", "write_dataset"]
 
 
 @contextmanager
@@ -28,13 +30,36 @@ def progress_bar(total: int | None, what: str) -> Iterator[Progress]:
         yield advance
 
 
-def write_dataset(recipe: Recipe, out: Path, workers: int | None, resume: bool, overwrite: bool, what: str) -> None:
-    """Make a dataset with a progress bar, and say what it is."""
+def write_dataset(
+    recipe: Recipe,
+    out: Path,
+    what: str,
+    *,
+    workers: int | None,
+    engine: str,
+    scheduler: str | None,
+    shard_range: range | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Make a dataset with a progress bar, and say what it is; the options are those of ``run_options``."""
     if resume and overwrite:
         raise click.UsageError("--resume and --overwrite exclude each other")
+    if (engine == "dask") != (scheduler is not None):
+        raise click.UsageError("--engine dask and --scheduler ADDR belong together")
+    total = recipe.n if shard_range is None else min(len(shard_range) * recipe.shard_size, recipe.n)
+    how: dict[str, Any] = {"workers": workers, "resume": resume, "overwrite": overwrite}
     try:
-        with progress_bar(recipe.n, what) as progress:
-            run = generate(recipe, out, workers=workers, resume=resume, overwrite=overwrite, progress=progress)
+        with (
+            nullcontext() if scheduler is None else dask_executor(scheduler) as executor,
+            progress_bar(total, what) as progress,
+        ):
+            how |= {"executor": executor, "progress": progress}
+            if shard_range is not None:
+                images = generate_part(recipe, out, shard_range, **how)
+                click.echo(f"{out}: {images} images in shards {shard_range.start}:{shard_range.stop}; no manifest yet")
+                return
+            run = generate(recipe, out, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
     if run.broken:
@@ -42,7 +67,11 @@ def write_dataset(recipe: Recipe, out: Path, workers: int | None, resume: bool, 
         click.echo(
             f"kpbench: {len(run.broken)} background files could not be decoded and were passed over: {shown}", err=True
         )
-    dataset = run.dataset
+    tell_dataset(run.dataset)
+
+
+def tell_dataset(dataset: Dataset) -> None:
+    """One line about a finished dataset."""
     click.echo(
         f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}"
     )

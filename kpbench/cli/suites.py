@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
-from kpbench.cli.options import FINITE, ONLY, SEED, SIZE, WORKERS
+from kpbench.cli.options import FINITE, ONLY, SEED, SIZE, run_options
 
 __all__ = ["degrade", "suite"]
 
@@ -38,9 +39,7 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @ONLY
 @click.option("--distortion", type=Distortion(), help="Lens distortion as OpenCV's coefficients; default: none.")
 @click.option("--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Tags in the place of patches.")
-@WORKERS
-@click.option("--resume", is_flag=True, help="Finish an interrupted run.")
-@click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder.")
+@run_options
 def suite(
     name: str,
     out: Path | None,
@@ -51,9 +50,7 @@ def suite(
     only: tuple[str, ...],
     distortion: tuple[float, ...] | None,
     board: str | None,
-    workers: int | None,
-    resume: bool,
-    overwrite: bool,
+    **run: Any,
 ) -> None:
     """Write the images of a benchmark suite: paper-v1, extended-v1, or a .toml file of your own.
 
@@ -67,7 +64,7 @@ def suite(
     from kpbench.suite import SuiteConfig, load_suite
 
     config = SuiteConfig(load_suite(name), images, seed, size, only, backgrounds, distortion or (), board)
-    write_dataset(config, out or Path("kpbench-suite") / config.name, workers, resume, overwrite, "suite")
+    write_dataset(config, out or Path("kpbench-suite") / config.name, "suite", **run)
 
 
 @click.command()

@@ -1,4 +1,7 @@
 import multiprocessing
+import runpy
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -6,8 +9,9 @@ import pytest
 
 from kpbench import store
 from kpbench.errors import DataError
-from kpbench.pipeline import generate
+from kpbench.generation import generate, generate_part, merge
 from kpbench.synth import SynthConfig
+from kpbench.workers import dask_executor
 
 
 @pytest.fixture(scope="module")
@@ -144,3 +148,71 @@ def test_a_disk_too_small_is_told_before_the_start(tmp_path):
 def test_a_value_out_of_range_is_one_line(changes, says):
     with pytest.raises(DataError, match=says):
         config(None, **changes)
+
+
+def test_another_run_is_told_what_differs(photos, tmp_path):
+    generate(config(photos), tmp_path, workers=1)
+    with pytest.raises(DataError, match=r"\(seed is 0 there, 9 here\)"):
+        generate(config(photos, seed=9), tmp_path, workers=1, resume=True)
+
+
+def test_a_folder_with_other_files_is_left_alone(photos, tmp_path):
+    (tmp_path / "thesis.txt").write_text("mine")
+    for how in ({}, {"resume": True}, {"overwrite": True}):
+        with pytest.raises(DataError, match=r"holds other files \(thesis.txt"):
+            generate(config(photos), tmp_path, workers=1, **how)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.txt"]
+
+
+@pytest.mark.parametrize("apart", [False, True])
+def test_parts_are_put_together_to_the_same_bytes(photos, tmp_path, apart):
+    """Ten images are three shards; the parts share a folder, or have one each."""
+    generate(config(photos), tmp_path / "whole", workers=1)
+    folders = [tmp_path / ("b" if apart else "a"), tmp_path / "a"]
+    assert generate_part(config(photos), folders[0], range(2, 3), workers=1) == 2
+    with pytest.raises(DataError, match="shards are missing, first is number 0"):
+        merge(folders[0])
+    assert generate_part(config(photos), folders[1], range(2), workers=1) == 8
+    dataset = merge(tmp_path / "a", [folders[0]])
+    assert len(dataset) == 10
+    assert digests(tmp_path / "a") == digests(tmp_path / "whole")
+
+
+def test_parts_of_different_sets_are_not_put_together(photos, tmp_path):
+    generate_part(config(photos), tmp_path, range(2), workers=1)
+    generate_part(config(photos, seed=1), tmp_path, range(2, 3), workers=1)
+    with pytest.raises(DataError, match=r"shard-00002\.h5: of another dataset"):
+        merge(tmp_path)
+    with pytest.raises(DataError, match="--shard-range is 2:4, expected A:B with 0 <= A < B <= 3"):
+        generate_part(config(photos), tmp_path, range(2, 4), workers=1)
+    with pytest.raises(DataError, match="holds an unfinished dataset"):
+        generate_part(config(photos), tmp_path, range(2), workers=1)
+    assert generate_part(config(photos), tmp_path, range(2), workers=1, resume=True) == 8
+
+
+def test_any_executor_gives_the_same_bytes(photos, tmp_path):
+    generate(config(photos), tmp_path / "one", workers=1)
+    seen = []
+    with ThreadPoolExecutor(2) as executor:
+        generate(config(photos), tmp_path / "two", executor=executor, progress=seen.append)
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    assert sum(seen) == 10
+
+
+@pytest.mark.filterwarnings("default")
+def test_dask_gives_the_same_bytes(photos, tmp_path):
+    distributed = pytest.importorskip("distributed")
+    generate(config(photos), tmp_path / "one", workers=1)
+    local = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
+    with distributed.LocalCluster(**local) as cluster, dask_executor(cluster.scheduler_address) as executor:
+        generate(config(photos), tmp_path / "two", executor=executor)
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
+
+
+def test_whatever_ends_a_run_what_is_finished_stays():
+    """One random moment of each kind; benchmarks/interrupt.py tries many, and a full disk, which needs a mount."""
+    if not Path("/proc/self/task").exists():
+        pytest.skip("finds worker processes in /proc")
+    interrupt = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "interrupt.py"))
+    kinds = ("parent", "worker", "interrupt")
+    assert interrupt["strike_often"](kinds, 1).keys() == set(kinds)

@@ -1,0 +1,189 @@
+"""What a synthetic image costs, on one core: kpbench beside the floor and beside the obvious pipeline.
+
+floor      decode and resize one photograph, deflate, write: what no generator of photographs with shards can leave out
+kpbench    ``kpbench synth --deteriorate paper`` in this process: scenes, truth, effects, a shard written and synced
+obvious    what one would write in an afternoon: ``cv2.warpPerspective`` of each patch over the full frame,
+           albumentations' effects of the same kinds and number, ``h5py`` with ``compression="gzip"``
+
+All write images of one size from the same photographs, as many of them as give n images the reuse that 800 give
+20,000 (the floor decodes one for every image, kpbench keeps them). Each round times the three one after the other
+with the same seed, the slow one over a fifth of the images; times are the process's own (waiting for the disk is left
+out), ratios are medians over the rounds.
+
+    python benchmarks/synth.py --backgrounds photos/ [--n 500] [--rounds 7] [--channels 3] [--workers] [--profile]
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import os
+import pstats
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import deflate
+import h5py
+import numpy as np
+
+from kpbench.background import PhotoFolder, decode_photo
+from kpbench.design import Patch, shipped_patches
+from kpbench.generation import generate
+from kpbench.keypoints import UInt8
+from kpbench.synth import SynthConfig
+
+WIDTH, HEIGHT = 640, 480
+PATCH_PX = 512
+
+
+def floor(photos: PhotoFolder, out: Path, n: int, seed: int, channels: int) -> None:
+    rng = np.random.default_rng(seed)
+    with (out / "images.bin").open("wb") as file:
+        for _ in range(n):
+            photo = decode_photo(photos.path / photos.files[rng.integers(len(photos.files))], channels)
+            assert photo is not None
+            file.write(deflate.zlib_compress(cv2.resize(photo, (WIDTH, HEIGHT)), 1))
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def kpbench(photos: PhotoFolder, out: Path, n: int, seed: int, channels: int) -> None:
+    config = SynthConfig(n, seed, backgrounds=photos.path, channels=channels, shard_size=n)
+    generate(config, out / "set", workers=1)
+
+
+def drawn(patch: Patch) -> tuple[UInt8, UInt8]:
+    """A patch as a picture, and the disc's mask."""
+    axis = (np.arange(PATCH_PX) + 0.5) / PATCH_PX * 2 - 1
+    points = np.stack(np.meshgrid(axis, axis), axis=-1)
+    black = patch.is_black(points.reshape(-1, 2)).reshape(PATCH_PX, PATCH_PX)
+    disc = np.hypot(points[..., 0], points[..., 1]) <= 1
+    return np.where(black, 0, 255).astype(np.uint8), np.where(disc, 255, 0).astype(np.uint8)
+
+
+def obvious(photos: PhotoFolder, out: Path, n: int, seed: int, channels: int) -> None:
+    import albumentations as A
+
+    pictures = [drawn(patch) for patch in shipped_patches()]
+    rng = np.random.default_rng(seed)
+    worn = A.Compose([A.SomeOf(
+        [
+            A.RandomShadow(p=1), A.RandomRain(p=1), A.MotionBlur(blur_limit=9, p=1), A.Blur(blur_limit=7, p=1),
+            A.RandomBrightnessContrast(contrast_limit=0, p=1), A.GaussNoise(std_range=(0.02, 0.12), p=1),
+        ],
+        n=2,
+    )])  # fmt: skip
+    shape = (n, HEIGHT, WIDTH, channels)
+    with h5py.File(out / "set.h5", "w") as file:
+        images = file.create_dataset("images", shape, "u1", chunks=(1, *shape[1:]), compression="gzip")
+        for index in range(n):
+            image = cv2.imread(str(photos.path / photos.files[rng.integers(len(photos.files))]))
+            image = cv2.resize(image, (WIDTH, HEIGHT))
+            for _ in range(rng.integers(0, 11)):
+                picture, mask = pictures[rng.integers(4)]
+                radius, centre = np.exp(rng.uniform(np.log(5), np.log(80))), rng.uniform(0, 1, 2) * (WIDTH, HEIGHT)
+                corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * rng.uniform(0.6, 1.0, (4, 2)) * radius
+                flat = np.array([[0, 0], [PATCH_PX, 0], [PATCH_PX, PATCH_PX], [0, PATCH_PX]], np.float32)
+                H = cv2.getPerspectiveTransform(flat, (corners + centre).astype(np.float32))
+                there = cv2.warpPerspective(mask, H, (WIDTH, HEIGHT))[..., None] / 255.0
+                black, white = rng.uniform(0, 120), rng.uniform(180, 255)
+                ink = black + cv2.warpPerspective(picture, H, (WIDTH, HEIGHT))[..., None] / 255.0 * (white - black)
+                image = (image * (1 - there) + ink * there).astype(np.uint8)
+            image = worn(image=image)["image"]
+            images[index] = image if channels == 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)[..., None]
+        file.flush()
+
+
+Pipeline = Callable[[PhotoFolder, Path, int, int, int], None]
+PIPELINES: dict[str, Pipeline] = {"floor": floor, "kpbench": kpbench, "obvious": obvious}
+
+
+def timed(pipeline: Pipeline, photos: PhotoFolder, n: int, seed: int, channels: int) -> float:
+    """Processor time, ms an image."""
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.process_time()
+        pipeline(photos, Path(folder), n, seed, channels)
+        return (time.process_time() - start) / n * 1e3
+
+
+def some_of(photos: PhotoFolder, count: int, folder: str) -> PhotoFolder:
+    """A folder of links to evenly spaced photographs of another."""
+    for name in photos.files[:: max(1, len(photos.files) // count)][:count]:
+        (Path(folder) / Path(name).name).symlink_to((photos.path / name).resolve())
+    return PhotoFolder.open(folder)
+
+
+def compare(photos: PhotoFolder, n: int, rounds: int, channels: int) -> None:
+    counts = (n, n, n // 5)
+    for pipeline in PIPELINES.values():  # imports, caches
+        timed(pipeline, photos, 20, 10**6, channels)
+    rows = np.array([
+        [timed(p, photos, k, seed, channels) for p, k in zip(PIPELINES.values(), counts, strict=True)]
+        for seed in range(rounds)
+    ])  # fmt: skip
+    for name, column in zip(PIPELINES, rows.T, strict=True):
+        print(f"{name:8} {np.median(column):7.2f} ms an image  ({column.min():.2f} to {column.max():.2f})")
+    print(f"kpbench / floor   {np.median(rows[:, 1] / rows[:, 0]):.2f}")
+    print(f"obvious / kpbench {np.median(rows[:, 2] / rows[:, 1]):.2f}")
+
+
+def profile(photos: PhotoFolder, n: int, channels: int) -> None:
+    """Where kpbench's time goes: cumulative time of its stages, then the functions by their own time."""
+    run: Any = cProfile.Profile()
+    timed(kpbench, photos, 20, 10**6, channels)
+    run.runcall(timed, kpbench, photos, n, 0, channels)
+    stats = pstats.Stats(run).strip_dirs()
+    stats.sort_stats("cumulative").print_stats("synth.py|scene.py|degrade.py|store.py|background.py|raster.py|hash")
+    stats.sort_stats("tottime").print_stats(25)
+
+
+def scaling(photos: PhotoFolder, n: int, rounds: int, channels: int) -> None:
+    """One and two workers as whole commands, in turn; the peak memory of the largest process of each."""
+    code = (
+        "import resource, sys; from kpbench.cli import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print(*(resource.getrusage(w).ru_maxrss / 1024 for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)))"
+    )
+    spent: dict[tuple[int, int], list[float]] = {}
+    for _ in range(rounds):
+        for images, workers in ((n, 1), (n, 2), (2 * n, 2)):
+            with tempfile.TemporaryDirectory() as folder:
+                words = ["synth", "--n", images, "--workers", workers, "--channels", channels, "--shard-size", n // 10]
+                words += ["--backgrounds", photos.path, "--out", Path(folder) / "set"]
+                start = time.perf_counter()
+                done = subprocess.run(
+                    [sys.executable, "-c", code, *map(str, words)], check=True, capture_output=True, text=True
+                )
+                spent.setdefault((images, workers), []).append(time.perf_counter() - start)
+                own, child = (float(v) for v in done.stdout.split()[-2:])
+                took = spent[images, workers][-1]
+                print(f"n {images}, workers {workers}: {took:.1f} s, peak {own:.0f} / {child:.0f} MB")
+    ratio = np.median(np.array(spent[n, 1]) / np.array(spent[n, 2]))
+    print(f"one worker / two workers {ratio:.2f}")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backgrounds", type=Path, required=True)
+    parser.add_argument("--n", type=int, default=500)
+    parser.add_argument("--rounds", type=int, default=7)
+    parser.add_argument("--channels", type=int, default=1, choices=(1, 3))
+    parser.add_argument("--workers", action="store_true", help="time one worker and two instead")
+    parser.add_argument("--profile", action="store_true", help="profile kpbench instead")
+    given = parser.parse_args()
+    cv2.setNumThreads(1)
+    folder = PhotoFolder.open(given.backgrounds)
+    if given.profile:
+        profile(folder, given.n, given.channels)
+    elif given.workers:
+        scaling(folder, given.n, given.rounds, given.channels)
+    else:
+        with tempfile.TemporaryDirectory() as kept:
+            compare(some_of(folder, max(1, given.n // 25), kept), given.n, given.rounds, given.channels)
