@@ -24,6 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset")
     parser.add_argument("--model")
+    parser.add_argument("--images", type=int, help="only the first so many")
     options = parser.parse_args()
     dataset = kpbench.open_dataset(options.dataset)
     detector = SuperPointDetector(options.model) if options.model else SmallSuperPointDetector()
@@ -40,7 +41,8 @@ def main() -> None:
         return found
 
     verify.examine = examine
-    for n in range(len(dataset)):
+    count = min(options.images or len(dataset), len(dataset))
+    for n in range(count):
         image, keypoints = dataset[n]
         truths[n % 2] += len(keypoints)
         detector(image)
@@ -49,11 +51,11 @@ def main() -> None:
             alone.append(found.score)
             alone_right.append(_right(found.xy, found.patch_id, keypoints))
         if sys.stderr.isatty():
-            print(f"\r{n + 1}/{len(dataset)}", end="", file=sys.stderr)
+            print(f"\r{n + 1}/{count}", end="", file=sys.stderr)
     X, y, test = np.concatenate(evidence), np.concatenate(right), np.concatenate(odd) == 1
     weights, bias = _fitted(X[~test], y[~test])
     print("WEIGHTS = np.array([" + ", ".join(f"{w:.3g}" for w in weights) + f"])\nBIAS = {bias:.3g}")
-    images = len(dataset) // 2
+    images = count // 2
     print("false alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
     for name, score, good in (
         ("verified", X[test] @ weights + bias, y[test]),
