@@ -81,6 +81,8 @@ class Report:
         Versions, command, fingerprints.
     comparisons : tuple of Comparison
         Of the first run with others; may be empty.
+    poses : tuple of Table
+        Of :func:`kpbench.exhibits.pose_table`; may be empty.
     title : str
     """
 
@@ -89,6 +91,7 @@ class Report:
     cases: tuple[tuple[Case, ...], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     comparisons: tuple[Comparison, ...] = ()
+    poses: tuple[Table, ...] = ()
     title: str = "kpbench report"
 
     @property
@@ -174,6 +177,8 @@ def sections(report: Report) -> Iterator[Section]:
             "Errors are of matches only, so they cannot exceed the reach of a match.",
             (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"), *tables),
         )
+    if report.poses:
+        yield Section("Pose", "The board's pose from the matched detections, by solvePnP.", report.poses)
     if any(run.confusion for run in runs):
         yield Section(
             "Identities",

@@ -26,10 +26,11 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml
 from kpbench.geometry import Camera
+from kpbench.keypoints import Float
 from kpbench.scene import measure_contrast, stream
 from kpbench.tags import TAG_BOARDS, tag_board
 
-__all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "load_suite", "shipped_suites"]
+__all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "board_in_view", "load_suite", "shipped_suites"]
 
 SCHEMA = "kpbench.suite/1"
 BOARD_SIDE_MM = 187.5  # a disc of 30 mm
@@ -286,6 +287,26 @@ def _listed(condition: Condition) -> dict[str, Any]:
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]
     return {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
+
+
+def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
+    """The board that a suite's images show, from its dataset's config.
+
+    Returns
+    -------
+    points_mm : ndarray of shape (K, 3)
+        Its keypoints with z = 0, in the order of the truth.
+    camera : Camera
+        None in the place of both if the dataset is of no suite.
+    """
+    if config.get("kind") != "suite":
+        return None
+    width, height = config["size_px"]
+    k1, k2, p1, p2, k3 = config["distortion"]
+    camera = Camera(width, height, config["focal_px"], (k1, k2, p1, p2, k3))
+    if "board" in config:
+        return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
+    return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera  # the same places whatever the patch
 
 
 def shipped_suites() -> dict[str, Path]:

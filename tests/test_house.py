@@ -32,7 +32,7 @@ LAYERS = [
     {"metrics", "bootstrap"},
     {"tally"},
     {"scoring"},
-    {"breakpoints", "charts", "comparison", "gallery", "paper", "preview", "tables"},
+    {"breakpoints", "charts", "comparison", "gallery", "paper", "pose", "preview", "tables"},
     {"exhibits", "interchange"},
     {"report"},
     {"generation"},
@@ -42,7 +42,7 @@ LAYERS = [
 EVALUATOR = {
     *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "coco", "program", "detect", "store"),
     *("sources", "breakpoints", "charts", "comparison", "exhibits", "gallery", "interchange", "paper", "preview"),
-    *("report", "tables"),
+    *("pose", "report", "tables"),
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),

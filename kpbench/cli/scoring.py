@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from kpbench.predictions import Predictions
     from kpbench.scoring import Scores
     from kpbench.store import Dataset
+    from kpbench.tables import Table
 
 __all__ = ["compare", "score"]
 
@@ -74,6 +75,7 @@ def how_to_score(command: Callable[..., None]) -> Callable[..., None]:
 @how_to_score
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row a condition, rung and patch.")
+@click.option("--pose", is_flag=True, help="Errors of the board's pose too; for the datasets of a suite.")
 @click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
 @click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")
 def score(
@@ -82,6 +84,7 @@ def score(
     report_file: Path | None,
     json_file: Path | None,
     csv_file: Path | None,
+    pose: bool,
     least: tuple[tuple[str, float], ...],
     most: tuple[tuple[str, float], ...],
     **how: Any,
@@ -97,19 +100,23 @@ def score(
     from kpbench.report import provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
     from kpbench.store import write_atomic
+    from kpbench.tables import to_plain
 
     _check_report(report_file)
     dataset, (scores,) = _scored([preds], gt, how)
+    poses = (_poses(scores, dataset),) if pose else ()
     known = provenance(dataset, [preds], ["kpbench", *sys.argv[1:]])
     if json_file:
         write_atomic(json_file, scores_file(scores, known))
     if csv_file:
         write_atomic(csv_file, scores_csv(scores, known))
     if report_file:
-        _write_report(report_file, [scores], dataset, known)
+        _write_report(report_file, [scores], dataset, known, poses=poses)
     click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
     click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
     click.echo(_summary(scores))
+    for table in poses:
+        click.echo(f"\n{table.title}\n{to_plain(table)}")
     check_gates(scores, dict(least), dict(most))
 
 
@@ -191,12 +198,25 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
     return dataset, scores
 
 
+def _poses(scores: Scores, dataset: Dataset | CocoDataset) -> Table:
+    from kpbench.errors import DataError
+    from kpbench.exhibits import pose_table
+    from kpbench.pose import pose_errors
+    from kpbench.suite import board_in_view
+
+    view = board_in_view(dataset.config)
+    if view is None:
+        raise DataError(f"{dataset.path}: shows no board that is known, --pose needs the dataset of a suite")
+    return pose_table(scores, pose_errors(scores.tally, *view))
+
+
 def _write_report(
     path: Path,
     runs: Sequence[Scores],
     dataset: Dataset | CocoDataset,
     known: dict[str, Any],
     comparisons: Sequence[Comparison] = (),
+    poses: Sequence[Table] = (),
 ) -> None:
     from kpbench.errors import DataError
     from kpbench.gallery import Case, worst_cases
@@ -209,7 +229,7 @@ def _write_report(
         except DataError as error:
             click.echo(f"kpbench: {path} shows no images: {error}", err=True)
     title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
-    write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), title))
+    write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), tuple(poses), title))
 
 
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset | CocoDataset:

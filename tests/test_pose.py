@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+
+from kpbench.errors import DataError
+from kpbench.exhibits import pose_table
+from kpbench.geometry import Camera
+from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.pose import pose_errors
+from kpbench.scoring import score
+from kpbench.suite import SuiteConfig, board_in_view, load_suite
+
+CAMERA = Camera(640, 480, 500.0, (0.02, -0.01, 0.0, 0.0, 0.0))
+BOARD = np.array([[np.cos(a), np.sin(a), 0] for a in np.arange(6) * np.pi / 3]) * 60.0
+
+
+def turn(axis, deg):
+    """Rotation about a unit axis (Rodrigues' formula)."""
+    x, y, z = np.asarray(axis) / np.linalg.norm(axis)
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(np.radians(deg)) * K + (1 - np.cos(np.radians(deg))) * K @ K
+
+
+def seen(R, t):
+    return CAMERA.project(BOARD @ R.T + t)
+
+
+TRUE = [(turn([1, 0.2, 0], tilt), np.array([20.0, -10.0, 500.0])) for tilt in (10, 30, 50)]
+
+
+def truth_of(poses):
+    keypoints = np.zeros(6 * len(poses), KEYPOINT_DTYPE)
+    xy = np.concatenate([seen(*pose) for pose in poses])
+    keypoints["x"], keypoints["y"] = xy.T
+    keypoints["radius_major"] = keypoints["radius_minor"] = 20
+    n = len(poses)
+    ids = np.arange(n)
+    return Truth(ids, np.arange(n + 1) * 6, keypoints, np.array([""] * n), np.full(n, np.nan), ids)
+
+
+def errors(found):
+    return pose_errors(score(truth_of(TRUE), found, eps=1.0, resamples=0).tally, BOARD, CAMERA)
+
+
+def test_exact_detections_give_the_exact_pose():
+    e = errors([Detections(seen(*pose), np.ones(6)) for pose in TRUE])
+    assert e.translation_percent == pytest.approx(0, abs=1e-4)
+    assert e.rotation_deg == pytest.approx(0, abs=1e-4)
+
+
+def test_a_known_change_of_pose_is_the_error():
+    moved = [(turn([0, 0, 1], 2.0) @ R, t + np.array([0, 5.0, 0])) for R, t in TRUE]
+    e = errors([Detections(seen(*pose), np.ones(6)) for pose in moved])
+    distance = np.linalg.norm(TRUE[0][1])
+    assert e.translation_percent == pytest.approx(100 * 5 / distance, abs=1e-3)
+    assert e.rotation_deg == pytest.approx(2.0, abs=1e-3)
+
+
+def test_four_points_are_enough_and_three_are_none():
+    found = [Detections(seen(*pose)[:n], np.ones(n)) for pose, n in zip(TRUE, (4, 3, 0), strict=True)]
+    e = errors(found)
+    assert e.rotation_deg[0] == pytest.approx(0, abs=1e-3)
+    assert np.isnan(e.rotation_deg[1:]).all()
+    assert np.isnan(e.translation_percent[1:]).all()
+
+
+def test_false_alarms_and_identities_do_not_enter():
+    found = [
+        Detections(np.vstack([[[5, 5]], seen(*pose)[::-1]]), np.linspace(1, 0.5, 7), np.arange(7)) for pose in TRUE
+    ]
+    assert errors(found).translation_percent == pytest.approx(0, abs=1e-4)
+
+
+def test_images_must_show_the_board():
+    truth = truth_of(TRUE)
+    rows = score(truth, [Detections.none()] * 3, resamples=0).tally
+    with pytest.raises(DataError, match="image_id 0 has 6 keypoints, but the board has 5"):
+        pose_errors(rows, BOARD[:5], CAMERA)
+
+
+@pytest.mark.parametrize("board", [None, "aruco"])
+def test_a_suites_truth_is_its_board_seen_by_its_camera(board):
+    config = SuiteConfig(load_suite("paper-v1"), images=1, size_px=(640, 480), only=("pitch",), board=board)
+    points, camera = board_in_view(config.to_dict())
+    shots = [config.shot(n) for n in range(0, config.n, 5)]
+    n = len(shots)
+    counts = [len(shot.keypoints) for shot in shots]
+    truth = Truth(
+        np.arange(n),
+        np.append(0, np.cumsum(counts)),
+        np.concatenate([shot.keypoints for shot in shots]),
+        np.array(["pitch"] * n),
+        np.array([shot.rung for shot in shots]),
+        np.arange(n),
+    )
+    places = [np.stack([shot.keypoints["x"], shot.keypoints["y"]], axis=1) for shot in shots]
+    exact = [Detections(xy, np.ones(len(xy))) for xy in places]
+    scores = score(truth, exact, resamples=0)
+    e = pose_errors(scores.tally, points, camera)
+    assert np.nanmax(e.translation_percent) < 1e-3
+    table = pose_table(scores, e)
+    assert table.rows[0][:4] == ("all", "all", n, n)
+    assert [row[1] for row in table.rows[1:]] == [f"{r:g}" for r in sorted({s.rung for s in shots})]
+
+
+def test_other_datasets_have_no_board():
+    assert board_in_view({"kind": "synth"}) is board_in_view({}) is None
