@@ -138,7 +138,7 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
     width = WIDTH - LABEL - RIGHT
     for n, (name, counts) in enumerate(rows):
         y, x, total = n * ROW, float(LABEL), sum(counts)
-        parts.append(_text(LABEL - 8, y + 17, name, "end"))
+        parts.append(_text(LABEL - 8, y + 17, name if len(name) <= 20 else f"{name[:19]}…", "end"))
         for kind, count, style in zip(kinds, counts, styles, strict=True):
             wide = width * count / total if total else 0.0
             text = f"{name}: {count} {kind} ({count / total:.1%})" if total else ""
