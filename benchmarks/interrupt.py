@@ -81,13 +81,12 @@ def strike(kind: str, run: subprocess.Popen[str], out: Path) -> None:
                     pass
 
 
-def moment(kind: str, delay_s: float, folder: Path, expected: dict[str, str]) -> str:
-    """One disturbed run and its resumption; "struck" if the disturbance came before the end."""
+def moment(kind: str, shards: int, delay_s: float, folder: Path, expected: dict[str, str]) -> str:
+    """One run, disturbed a while after so many shards are there, and resumed; "struck" if that was before the end."""
     out = folder / "set"
     run = start(out)
-    deadline = time.monotonic() + 120  # the clock of the moment starts with the work, which the lock shows
-    while run.poll() is None and not (out / ".kpbench.lock").exists() and time.monotonic() < deadline:
-        time.sleep(0.005)
+    while run.poll() is None and not ((out / ".kpbench.lock").exists() and len(list(out.glob("*.h5"))) >= shards):
+        time.sleep(0.002)
     time.sleep(delay_s)
     strike(kind, run, out)
     _, said = run.communicate(timeout=120)
@@ -112,20 +111,13 @@ def strike_often(kinds: Sequence[str], moments: int, seed: int = 0) -> dict[str,
         base = Path(name)
         generate(CONFIG, base / "undisturbed", workers=1)
         expected = digests(base / "undisturbed")
-        begin = time.monotonic()
-        run = start(base / "timed")
-        while run.poll() is None and not (base / "timed" / ".kpbench.lock").exists():
-            time.sleep(0.005)
-            begin = time.monotonic()
-        run.communicate()
-        assert run.returncode == 0
-        span_s = time.monotonic() - begin
         tally = {kind: {"struck": 0, "finished": 0} for kind in kinds}
         for kind, n in itertools.product(kinds, range(moments)):
             folder = base / f"{kind}-{n}"
             folder.mkdir()
             with small_disk(folder, 64) if kind == "disk" else nullcontext():
-                tally[kind][moment(kind, rng.uniform(0, span_s), folder, expected)] += 1
+                when = int(rng.integers(12)), float(rng.uniform(0, 0.2))
+                tally[kind][moment(kind, *when, folder, expected)] += 1
         return tally
 
 

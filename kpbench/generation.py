@@ -289,20 +289,28 @@ def _complete(
     progress(sum(entry.count for entry, _ in kept.values()))
     results = dict(kept)
     work = partial(_write_shard, config, written, folder.resolve())
-    try:
+    with _resumable(folder):
         for entry, met in run_pieces(work, todo, workers, progress, executor):
             results[entry.file] = (entry, met)
+    return results
+
+
+@contextmanager
+def _resumable(folder: Path) -> Iterator[None]:
+    """Let errors name the folder as the user does, and say how to go on."""
+    try:
+        yield
     except DataError as error:
         said = str(error).replace(str(folder.resolve()), str(folder))
         said = said if said.startswith(str(folder)) else f"{folder}: {said}"
         raise DataError(f"{said}; finished shards are kept, add --resume to go on") from None
-    return results
 
 
 def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[store.Dataset, tuple[str, ...]]:
     """Write the manifest, which makes the folder a dataset."""
     broken = tuple(sorted({file for _, files in results for file in files}))
-    store.write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
+    with _resumable(folder):
+        store.write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
     return store.open_dataset(folder), broken
 
 
