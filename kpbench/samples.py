@@ -30,6 +30,7 @@ from kpbench.geometry import projected_discs
 from kpbench.keypoints import Float, UInt8
 from kpbench.lookalikes import draw_lookalikes
 from kpbench.scene import Limits, Placement, paint, random_placements, random_poses, rasterise, render_scene
+from kpbench.workers import one_thread
 
 __all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]
 
@@ -185,7 +186,7 @@ def _start_worker(
     if own:  # the main process decides when to stop, and takes its workers with it
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        cv2.setNumThreads(1)
+        one_thread()
     photos = load_photos(folder, "training")
     _worker.update(config=config, patches=patches, photos=photos, seed=seed)
 

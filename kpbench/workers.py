@@ -22,10 +22,11 @@ from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import cv2
+from threadpoolctl import threadpool_limits
 
 from kpbench.errors import DataError
 
-__all__ = ["Progress", "cores", "dask_executor", "run_pieces"]
+__all__ = ["Progress", "cores", "dask_executor", "one_thread", "run_pieces"]
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -71,7 +72,7 @@ def run_pieces(
             for future in futures:
                 future.cancel()
     elif workers <= 1:
-        cv2.setNumThreads(1)
+        one_thread()
         for piece in pieces:
             yield work(piece, progress)
     else:
@@ -137,6 +138,12 @@ def dask_executor(address: str) -> Iterator[Executor]:
             raise DataError(f"{address}: its workers died; finished shards are kept, add --resume to go on") from None
 
 
+def one_thread() -> None:
+    """One thread a process: BLAS's own cost more than they bring on matrices as small as ours."""
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+
+
 _counter: Any = None
 
 
@@ -144,7 +151,7 @@ def _start_worker(counter: Any) -> None:
     """Runs once in each worker: one thread, Ctrl-C is the parent's business, and an orphan ends."""
     global _counter
     _counter = counter
-    cv2.setNumThreads(1)
+    one_thread()
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -168,7 +175,7 @@ def _in_worker(work: Callable[[Piece, Progress], Result], piece: Piece) -> Resul
 
 def _alone(work: Callable[[Piece, Progress], Result], piece: Piece) -> tuple[Result, int]:
     """A piece's result and its number of images, where no counter is shared."""
-    cv2.setNumThreads(1)
+    one_thread()
     images = 0
 
     def count(more: int) -> None:
