@@ -27,7 +27,9 @@ __all__ = [
     "random_poses",
     "rasterise",
     "render_scene",
+    "share_inside",
     "stream",
+    "tabulate",
 ]
 
 
@@ -207,16 +209,22 @@ def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendered
         ``keypoints["contrast"]`` is nan, see :func:`measure_contrast`.
     """
     image = background.copy()
-    keypoints = np.zeros(len(placements), KEYPOINT_DTYPE)
     masks = rasterise(placements)
+    visible = [paint(image, m, p.black, p.white) for m, p in zip(masks, placements, strict=True)]
+    return Rendered(image, tabulate(placements, visible), tuple(masks))
+
+
+def tabulate(placements: Sequence[Placement], visible: Sequence[float]) -> NDArray[Any]:
+    """The :data:`KEYPOINT_DTYPE` table of patches of which these fractions are visible; ``contrast`` is nan."""
+    keypoints = np.zeros(len(placements), KEYPOINT_DTYPE)
     if placements:
         H = keypoints["H_patch2image"] = np.stack([p.H_patch2image for p in placements])
         _, keypoints["radius_major"], keypoints["radius_minor"], keypoints["axis_angle"] = projected_discs(H)
         keypoints["x"], keypoints["y"] = H[:, 0, 2] / H[:, 2, 2], H[:, 1, 2] / H[:, 2, 2]
         keypoints["patch_id"] = [p.patch.patch_id for p in placements]
-        keypoints["visible"] = [paint(image, m, p.black, p.white) for m, p in zip(masks, placements, strict=True)]
+        keypoints["visible"] = visible
     keypoints["contrast"] = np.nan
-    return Rendered(image, keypoints, tuple(masks))
+    return keypoints
 
 
 def inside_image(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
@@ -239,6 +247,12 @@ def paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
         ink, below = ink[..., None], below[..., None]
     image[there] = np.rint(image[there] * below + ink)
     return float(disc.sum() / mask.disc.sum())
+
+
+def share_inside(image: UInt8, mask: Mask) -> float:
+    """The fraction of a patch that lies in the image."""
+    _, here = inside_image(mask.box, image)
+    return float(mask.disc[here].sum() / mask.disc.sum())
 
 
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:

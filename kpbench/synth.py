@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -10,16 +11,26 @@ from typing import Any
 import numpy as np
 
 from kpbench import degrade
+from kpbench.augment import augment
 from kpbench.background import Background, PhotoFolder, procedural
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError
 from kpbench.lookalikes import draw_lookalikes
-from kpbench.scene import Limits, measure_contrast, random_placements, render_scene, stream
+from kpbench.scene import (
+    Limits,
+    measure_contrast,
+    random_placements,
+    rasterise,
+    render_scene,
+    share_inside,
+    stream,
+    tabulate,
+)
 from kpbench.store import Sample
 
 __all__ = ["SynthConfig"]
 
-BACKGROUND, SCENE, DETERIORATION, LOOKALIKES = range(4)
+BACKGROUND, SCENE, DETERIORATION, LOOKALIKES, AUGMENTATION = range(5)
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,7 @@ class SynthConfig:
     shard_size : images a shard; changes the files but no image.
     backgrounds : folder of photographs, or None for procedural ones.
     distractors : look-alikes an image (:mod:`kpbench.lookalikes`), up to so many; the scenes are the same.
+    augmentation : an albumentations pipeline (:func:`kpbench.augment.load_augmentation`), applied last.
     limits : what a scene may hold.
     patches : the designs to place.
 
@@ -53,6 +65,7 @@ class SynthConfig:
     shard_size: int = 500
     backgrounds: Path | None = None
     distractors: int = 0
+    augmentation: str | None = None
     limits: Limits = field(default_factory=Limits)
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
 
@@ -91,6 +104,7 @@ class SynthConfig:
             "shard_size": self.shard_size,
             "backgrounds": source,
             "distractors": self.distractors,
+            "augmentation": self.augmentation and json.loads(self.augmentation),
             "limits": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.limits).items()},
             "patches": [patch.to_dict() for patch in self.patches],
         }
@@ -120,8 +134,15 @@ class SynthConfig:
         image, effects = scene.image, list[dict[str, Any]]()
         if self.deteriorate == "paper":
             image, effects = degrade.paper_mix(image, stream(self.seed, index, DETERIORATION))
-        scene.keypoints["contrast"] = measure_contrast(image, scene.masks)
-        return Sample(index, image, scene.keypoints, effects, background.file), background.broken
+        keypoints, masks = scene.keypoints, scene.masks
+        if self.augmentation is not None:
+            seed = int(stream(self.seed, index, AUGMENTATION).integers(2**31))
+            image, placements = augment(image, placements, self.augmentation, seed)
+            masks = tuple(rasterise(placements))
+            keypoints = tabulate(placements, [share_inside(image, mask) for mask in masks])
+            effects = [*effects, {"effect": "augmentation", "seed": seed}]
+        keypoints["contrast"] = measure_contrast(image, masks)
+        return Sample(index, image, keypoints, effects, background.file), background.broken
 
     def _background(self, rng: np.random.Generator) -> Background:
         width, height = self.size_px

@@ -20,7 +20,7 @@ LAYERS = [
     {"tags"},
     {"sheet", "analysis", "search", "design_figure"},
     {"scene", "degrade"},
-    {"camera"},
+    {"augment", "camera"},
     {"coco", "store", "predictions", "sources"},
     {"synth", "suite", "samples", "recipe"},
     {"match"},
@@ -46,7 +46,7 @@ EVALUATOR = {
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
-    *("background", "lookalikes", "tags", "scene", "degrade", "camera", "synth", "suite", "samples"),
+    *("background", "lookalikes", "tags", "scene", "degrade", "augment", "camera", "synth", "suite", "samples"),
 }
 TORCH = {"network", "train", "export"}
 

@@ -30,6 +30,11 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
     show_default=True,
     help="Up to so many look-alikes an image, without a label: discs, rings, half-patches, chequers, text.",
 )
+@click.option(
+    "--augment",
+    type=click.Path(path_type=Path),
+    help="Your own albumentations pipeline, as albumentations.save writes it (JSON or YAML), applied last.",
+)
 @click.option("--shard-size", type=int, default=500, show_default=True, help="Images a file.")
 @run_options
 def synth(
@@ -42,6 +47,7 @@ def synth(
     channels: int,
     deteriorate: str,
     distractors: int,
+    augment: Path | None,
     shard_size: int,
     **run: Any,
 ) -> None:
@@ -51,8 +57,10 @@ def synth(
     Examples:
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
       kpbench synth --n 500 --patches mine.toml --patches other.toml --out own-designs
+      kpbench synth --n 500 --deteriorate none --augment pipeline.json --out augmented
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
+    from kpbench.augment import load_augmentation
     from kpbench.cli.progress import write_dataset
     from kpbench.design import load_patches, shipped_patches
     from kpbench.synth import SynthConfig
@@ -66,6 +74,7 @@ def synth(
         shard_size=shard_size,
         backgrounds=backgrounds,
         distractors=distractors,
+        augmentation=None if augment is None else load_augmentation(augment),
         patches=load_patches(patches) if patches else shipped_patches(),
     )
     write_dataset(config, out, "synth", **run)

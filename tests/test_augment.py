@@ -1,0 +1,99 @@
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from kpbench import match, refine
+from kpbench.augment import augment, load_augmentation
+from kpbench.cli import main
+from kpbench.design import shipped_patches
+from kpbench.errors import DataError
+from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.store import open_dataset
+
+WITH_ROOM = Limits(count=(6, 6), radius_px=(20, 50), tilt_deg=30)
+
+
+def saved(tmp_path, *names_and_options, suffix="json"):
+    """A file as albumentations.save writes it."""
+    transforms = [{"__class_fullname__": name, "p": 1.0, **options} for name, options in names_and_options]
+    whole = {"__class_fullname__": "Compose", "p": 1.0, "transforms": transforms}
+    path = tmp_path / f"pipeline.{suffix}"
+    path.write_text(json.dumps({"__version__": "2.0.8", "transform": whole}))  # JSON is YAML too
+    return path
+
+
+def scene(seed):
+    placements = random_placements(np.random.default_rng(seed), 480, 480, shipped_patches(), WITH_ROOM)
+    return render_scene(np.full((480, 480), 140, np.uint8), placements).image, placements
+
+
+@pytest.mark.parametrize(
+    "pipeline",
+    [
+        [("RandomResizedCrop", {"size": [480, 480], "scale": [0.5, 1.0]})],
+        [("Resize", {"height": 960, "width": 960}), ("CenterCrop", {"height": 480, "width": 480})],
+        [("Affine", {"scale": [0.8, 1.3], "rotate": [-30, 30], "shear": [-8, 8]})],
+        [("Perspective", {})],
+        [("OneOf", {"transforms": [{"__class_fullname__": "OpticalDistortion", "p": 1.0}]})],
+    ],
+    ids=lambda pipeline: pipeline[0][0],
+)
+def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
+    canonical = load_augmentation(saved(tmp_path, *pipeline))
+    off = []
+    for seed in range(4):
+        image, carried = augment(*scene(seed), canonical, seed)
+        H = np.array([placement.H_patch2image for placement in carried])
+        affine = H[:, :2, :2] - H[:, :2, 2:] @ H[:, 2:, :2]
+        fit = refine.fit(match.pyramid(image, 0), H[:, :2, 2], affine, [p.patch for p in carried])
+        off.extend(np.linalg.norm(fit.xy - H[:, :2, 2], axis=1)[fit.ncc > 0.97])
+    assert len(off) >= 6
+    assert np.median(off) < 0.03
+    assert max(off) < 0.25
+
+
+def test_what_moves_nothing_leaves_the_truth_as_it_is(tmp_path):
+    image, placements = scene(0)
+    done, carried = augment(image, placements, load_augmentation(saved(tmp_path, ("GaussNoise", {}))), 3)
+    assert carried == placements
+    assert (done != image).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("HorizontalFlip", {}, "mirrors"),
+        ("Resize", {"height": 100, "width": 100}, "(100, 100)"),
+        ("RandomCrop", {"height": 900, "width": 900}, "--augment: "),
+    ],
+)
+def test_what_cannot_be_carried_is_refused(name, options, said, tmp_path):
+    canonical = load_augmentation(saved(tmp_path, (name, options)))
+    with pytest.raises(DataError) as refused:
+        augment(*scene(1), canonical, 0)
+    assert said in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("text", ["", "[1]", '{"transform": {"__class_fullname__": "NoSuchThing"}}', "{"])
+def test_a_file_without_a_pipeline_is_refused(text, tmp_path):
+    path = tmp_path / "wrong.json"
+    path.write_text(text)
+    done = CliRunner().invoke(main, ["synth", "--n", "2", "--augment", str(path), "--out", str(tmp_path / "set")])
+    assert done.exit_code == 1
+    assert f"{path}: no pipeline" in str(done.exception or done.output) + done.output
+    assert not (tmp_path / "set").exists()
+
+
+def test_augmented_sets_are_the_same_whatever_the_workers(tmp_path):
+    path = saved(tmp_path, ("SafeRotate", {}), ("GaussNoise", {}), suffix="yaml")
+    command = ["synth", "--n", "6", "--size", "160x120", "--shard-size", "3", "--augment", str(path)]
+    for workers in ("1", "2"):
+        out = str(tmp_path / workers)
+        assert CliRunner().invoke(main, [*command, "--workers", workers, "--out", out]).exit_code == 0
+    one, two = (open_dataset(tmp_path / workers) for workers in ("1", "2"))
+    assert one.fingerprint == two.fingerprint
+    assert one.config["augmentation"]["transform"]["transforms"][0]["__class_fullname__"] == "SafeRotate"
+    assert one.effects(0)[-1]["effect"] == "augmentation"
