@@ -122,8 +122,10 @@ def encode_shard(
     """
     buffer = io.BytesIO()
     # v110 file structures carry checksums, so that a flipped byte outside the data is seen on reading. Only the
-    # heap of variable-length strings has none (and HDF5 can loop for ever over a damaged one): text is of fixed length
-    with h5py.File(buffer, "w", libver=("v110", "v110")) as file:
+    # heap of variable-length strings has none (and HDF5 can loop for ever over a damaged one): text is of fixed length.
+    # Without a chunk cache a column gets its place when it is written; else it gets it when Python frees the h5py
+    # object, which another thread's garbage collection can put off
+    with h5py.File(buffer, "w", libver=("v110", "v110"), rdcc_nbytes=0) as file:
         kept = _write_images(file, samples, count)
         attributes = {
             "schema": SCHEMA,

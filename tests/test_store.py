@@ -81,6 +81,17 @@ def test_the_same_samples_give_the_same_bytes():
     assert encode_shard(samples(), 4, CONFIG) == encode_shard(samples(), 4, CONFIG)
 
 
+def test_the_bytes_do_not_depend_on_when_objects_are_freed(monkeypatch):
+    before, kept, create = encode_shard(samples(), 4, CONFIG), [], h5py.Group.create_dataset
+
+    def create_and_keep(*arguments, **options):
+        kept.append(create(*arguments, **options))
+        return kept[-1]
+
+    monkeypatch.setattr(h5py.Group, "create_dataset", create_and_keep)
+    assert encode_shard(samples(), 4, CONFIG) == before
+
+
 def test_a_dataset_survives_pickling_and_forking(tmp_path):
     data = open_dataset(write_dataset(tmp_path / "set"))
     expected = data.image(5)
