@@ -21,7 +21,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
-from kpbench import store
+from kpbench import card, store
 from kpbench.errors import DataError
 from kpbench.workers import Progress, run_pieces
 
@@ -220,7 +220,7 @@ def _prepare(
         raise DataError(f"{folder}: holds other files ({there[0].name}, ...), expected a new or an empty folder")
     if overwrite:
         whole = plan[0][1] == 0 and len(plan) * plan[0][2] >= written["n"]
-        for path in [manifest, *(present if whole else mine)]:
+        for path in [manifest, *(folder / name for name in card.FILES), *(present if whole else mine)]:
             path.unlink(missing_ok=True)
     elif not resume and (manifest.exists() or mine):
         what = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
@@ -307,11 +307,13 @@ def _resumable(folder: Path) -> Iterator[None]:
 
 
 def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[store.Dataset, tuple[str, ...]]:
-    """Write the manifest, which makes the folder a dataset."""
+    """Write the manifest, which makes the folder a dataset, and its card."""
     broken = tuple(sorted({file for _, files in results for file in files}))
     with _resumable(folder):
         store.write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
-    return store.open_dataset(folder), broken
+        dataset = store.open_dataset(folder)
+        card.write_card(dataset, folder)
+    return dataset, broken
 
 
 def _check_space(folder: Path, image_bytes: int, images: int) -> None:

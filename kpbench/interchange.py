@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.card import write_card
 from kpbench.errors import DataError
 from kpbench.keypoints import KEYPOINT_DTYPE, UInt8
 from kpbench.store import Dataset, write_atomic
@@ -55,7 +56,9 @@ def export_dataset(dataset: Dataset, form: str, out: str | Path, progress: Progr
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
-    return FORMATS[form](dataset, folder, progress)
+    named = FORMATS[form](dataset, folder, progress)
+    write_card(dataset, folder)
+    return named
 
 
 def _png(image: UInt8) -> bytes:

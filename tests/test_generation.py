@@ -101,7 +101,7 @@ def test_another_dataset_in_the_folder_is_kept(photos, tmp_path):
             generate(changed, tmp_path, workers=1, resume=True)
     assert digests(tmp_path) == before
     generate(config(photos, n=3), tmp_path, workers=1, overwrite=True)
-    assert sorted(digests(tmp_path)) == ["dataset.json", "shard-00000.h5"]
+    assert sorted(digests(tmp_path)) == ["README.md", "dataset.json", "preview.png", "shard-00000.h5"]
 
 
 def _hold(folder, config, ready, release):

@@ -33,7 +33,8 @@ LAYERS = [
     {"tally"},
     {"scoring"},
     {"breakpoints", "charts", "comparison", "gallery", "paper", "pose", "preview", "tables"},
-    {"exhibits", "interchange"},
+    {"card", "exhibits"},
+    {"interchange"},
     {"report"},
     {"generation"},
     {"pipeline"},
@@ -41,7 +42,18 @@ LAYERS = [
 ]
 EVALUATOR = {
     *("assignment", "metrics", "bootstrap", "tally", "scoring", "predictions", "coco", "program", "detect", "store"),
-    *("sources", "breakpoints", "charts", "comparison", "exhibits", "gallery", "interchange", "paper", "preview"),
+    *(
+        "sources",
+        "breakpoints",
+        "card",
+        "charts",
+        "comparison",
+        "exhibits",
+        "gallery",
+        "interchange",
+        "paper",
+        "preview",
+    ),
     *("pose", "report", "tables"),
 }
 GENERATOR = {

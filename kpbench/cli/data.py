@@ -109,57 +109,18 @@ def inspect(dataset: Path) -> None:
     Example:
       kpbench inspect kpbench-data
     """
-    import numpy as np
-
+    from kpbench.card import facts, histograms
     from kpbench.store import open_dataset
 
     data = open_dataset(dataset)
-    truth = data.truth
-    keypoints = truth.keypoints
-    image = data.image(0)
-    size = sum(shard.bytes for shard in data.shards)
-    click.echo(f"dataset      {data.path}")
-    click.echo(f"fingerprint  {data.fingerprint}")
-    click.echo(f"images       {len(data)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}")
-    click.echo(
-        f"on disk      {size / 1e6:.1f} MB in {len(data.shards)} shards, {size / len(data) / 1e3:.1f} kB an image"
-    )
-    click.echo(
-        f"made from    seed {data.config.get('seed')}, {data.config.get('backgrounds', {}).get('kind', 'n/a')} "
-        f"backgrounds, deterioration {data.config.get('deteriorate', 'n/a')}"
-    )
-    ids, counts = np.unique(keypoints["patch_id"], return_counts=True)
-    click.echo(f"keypoints    {len(keypoints)}" + "".join(f", id {i}: {c}" for i, c in zip(ids, counts, strict=True)))
-    per_image = np.diff(truth.offsets)
-    click.echo(_histogram("an image", per_image, np.arange(per_image.max() + 2) - 0.5, "{:.0f}", centred=True))
-    if len(keypoints):
-        major, minor = keypoints["radius_major"], keypoints["radius_minor"]
-        octaves = np.array([0, 5, 8, 12, 20, 32, 50, 80, np.inf])
-        click.echo(_histogram("radius (major semi-axis), px", major, octaves, "{:g}"))
-        click.echo(_histogram("(major - minor) / major", (major - minor) / major, np.linspace(0, 1, 6), "{:.1f}"))
-        click.echo(
-            _histogram(
-                "contrast, grey levels",
-                keypoints["contrast"],
-                np.array([-np.inf, 0, 25, 50, 100, 150, 200, 256]),
-                "{:g}",
-            )
-        )
-        click.echo(_histogram("visible fraction", keypoints["visible"], np.array([0, 0.5, 0.75, 0.99, 1.01]), "{:g}"))
-
-
-def _histogram(title: str, values: object, edges: object, label: str, centred: bool = False) -> str:
-    """A histogram as text, one line a bin."""
-    import numpy as np
-
-    borders = np.asarray(edges)
-    counts, _ = np.histogram(np.asarray(values), borders)
-    total, most = max(int(counts.sum()), 1), max(int(counts.max()), 1)
-    lines = [title]
-    for low, high, count in zip(borders[:-1], borders[1:], counts, strict=True):
-        name = label.format((low + high) / 2) if centred else f"{label.format(low)} to {label.format(high)}"
-        lines.append(f"  {name:>14} {count:>8} {count / total:6.1%} {'#' * round(30 * count / most)}")
-    return "\n".join(lines)
+    click.echo(f"{'dataset':12} {data.path}")
+    for name, value in facts(data).items():
+        click.echo(f"{name:12} {value}")
+    for histogram in histograms(data):
+        click.echo(histogram.title)
+        most = max(int(histogram.counts.max()), 1)
+        for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True):
+            click.echo(f"  {label:>14} {count:>8} {share:6.1%} {'#' * round(30 * count / most)}")
 
 
 @click.command()
@@ -197,15 +158,11 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
       kpbench preview kpbench-data --count 20 --columns 5
     """
     import cv2
-    import numpy as np
 
-    from kpbench.preview import contact_sheet, draw_keypoints
+    from kpbench.card import overview
     from kpbench.store import open_dataset, write_atomic
 
-    data = open_dataset(dataset)
-    chosen = np.unique(np.linspace(0, len(data) - 1, min(count, len(data))).astype(int))
-    scale = tile_width / data.image(0).shape[1]
-    sheet = contact_sheet([draw_keypoints(*data[int(i)], scale) for i in chosen], min(columns, len(chosen)))
+    sheet = overview(open_dataset(dataset), count, columns, tile_width)
     target = out or dataset / "preview.png"
     write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
     click.echo(str(target))
