@@ -1,14 +1,15 @@
-"""What several modules read from disk: TOML tables, and folders of images."""
+"""What several modules read: TOML tables, folders of images, and folders that are URLs."""
 
 from __future__ import annotations
 
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
 
-from kpbench.errors import KpbenchError
+from kpbench.errors import DataError, KpbenchError
 
-__all__ = ["IMAGE_SUFFIXES", "image_files", "read_toml"]
+__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_toml"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
@@ -36,3 +37,32 @@ def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
         raise error(f"{path}: cannot be read, not UTF-8 text") from None
     except tomllib.TOMLDecodeError as problem:
         raise error(f"{path}: not valid TOML ({problem})") from None
+
+
+def folder_at(where: str | Path) -> Path:
+    """A folder of this machine, or one that fsspec reaches by a URL such as ``s3://bucket/name``, used like a path.
+
+    Raises
+    ------
+    DataError
+        If it is a URL and what it takes to reach it is not installed.
+    """
+    if not is_local(where):
+        return where  # type: ignore[return-value]
+    url = re.match(r"([a-z][a-z0-9+.-]+):/+(.*)", str(where))  # pathlib makes one slash of two
+    if url is None:
+        return Path(where)
+    try:
+        from upath import UPath
+
+        folder = UPath(f"{url[1]}://{url[2]}")
+        assert folder.fs is not None  # looks for the file system's own package
+    except (ImportError, ValueError) as error:
+        said = " ".join(str(error).split())
+        raise DataError(f"{url[0]}: cannot be reached ({said}); pip install 'kpbench[remote]'") from None
+    return folder  # type: ignore[return-value]
+
+
+def is_local(path: object) -> bool:
+    """Whether a path is one of this machine's file system, and not a URL's."""
+    return isinstance(path, (str, Path))

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
@@ -23,6 +24,7 @@ from typing import Any, Protocol
 
 from kpbench import card, store
 from kpbench.errors import DataError
+from kpbench.files import folder_at, is_local
 from kpbench.workers import Progress, run_pieces
 
 __all__ = ["Recipe", "Run", "generate", "generate_part", "merge"]
@@ -94,7 +96,7 @@ def generate(
     ----------
     config : Recipe
         :class:`kpbench.synth.SynthConfig` or :class:`kpbench.suite.SuiteConfig`.
-    out : folder; made if it is not there.
+    out : folder, made if it is not there; or a URL that fsspec reaches, such as ``s3://bucket/name``.
     workers : processes; None for one a core. 1 works in this process.
     executor : where the shards are made instead, see :func:`kpbench.workers.run_pieces`; what runs there has to see
         the folder and the backgrounds under the same paths.
@@ -169,7 +171,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> store.Dataset:
     """
     folder = _made(out)
     with _locked(folder):
-        for part in map(Path, parts):
+        for part in map(folder_at, parts):
             for path in sorted(part.glob("shard-*.h5")):
                 if not (folder / path.name).exists():
                     _bring(path, folder / path.name)
@@ -194,7 +196,7 @@ def _bring(source: Path, target: Path) -> None:
 
 
 def _made(out: str | Path) -> Path:
-    folder = Path(out)
+    folder = folder_at(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -212,8 +214,8 @@ def _prepare(
 ) -> dict[str, Result]:
     """Look at what the folder holds; return the finished shards of the plan that this run can keep."""
     manifest = folder / store.MANIFEST
-    there = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    present = [path for path in there if path.match("shard-*.h5")]
+    there = [path for path in folder.glob("*") if not path.name.startswith(".")]
+    present = [path for path in there if fnmatch(path.name, "shard-*.h5")]
     names = {name for name, _, _ in plan}
     mine = [path for path in present if path.name in names]
     if there and not present and not manifest.exists():
@@ -318,6 +320,8 @@ def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tup
 
 def _check_space(folder: Path, image_bytes: int, images: int) -> None:
     """Refuse to start what cannot end."""
+    if not is_local(folder):
+        return
     need = images * image_bytes
     free = shutil.disk_usage(folder).free
     if need > free:
@@ -342,6 +346,9 @@ def _locked(folder: Path, shared: bool = False) -> Iterator[None]:
     try:
         import fcntl
     except ImportError:  # Windows has no flock; there the check is left out
+        yield
+        return
+    if not is_local(folder):  # nor has an object store
         yield
         return
     path = folder / LOCK

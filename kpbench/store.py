@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
+from kpbench.files import folder_at, is_local
 from kpbench.keypoints import KEYPOINT_DTYPE, Truth, UInt8
 
 __all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_atomic", "write_manifest"]
@@ -72,11 +73,17 @@ def canonical_json(content: object) -> str:
 def write_atomic(path: Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all: temporary sibling, fsync, rename, fsync of the folder.
 
+    Under a URL it is put in one piece, which object stores do whole or not at all.
+
     Raises
     ------
     DataError
         If the disk is full or the folder cannot be written; nothing is left behind.
     """
+    if not is_local(path):
+        with _reaching(path):
+            path.write_bytes(bytes(data))
+        return
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
         try:
@@ -99,6 +106,15 @@ def write_atomic(path: Path, data: bytes | memoryview) -> None:
     except OSError as error:
         why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
         raise DataError(f"{path}: cannot be written, {why}") from None
+
+
+@contextmanager
+def _reaching(path: Path) -> Iterator[None]:
+    """Turn whatever a remote file system raises into one line."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
 
 
 def encode_shard(
@@ -256,7 +272,7 @@ def open_shard(path: Path) -> Any:
         virtual datasets, filters that HDF5 does not have built in).
     """
     with _reading(path):
-        file = h5py.File(path, "r", locking="best-effort")
+        file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
         with _reading(path):
             _check_shard(file, path.stat().st_size)
@@ -413,14 +429,14 @@ class Dataset:
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a finished dataset folder.
+    """Open a finished dataset folder, of this machine or at a URL that fsspec reaches.
 
     Raises
     ------
     DataError
         If there is none, if its run was not finished, or if a shard is missing or of the wrong size.
     """
-    folder = Path(path)
+    folder = folder_at(path)
     try:
         manifest = json.loads((folder / MANIFEST).read_text("utf-8"))
         if manifest["schema"] != SCHEMA:

@@ -1,4 +1,5 @@
 import multiprocessing
+import os
 import runpy
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -216,3 +217,19 @@ def test_whatever_ends_a_run_what_is_finished_stays():
     interrupt = runpy.run_path(str(Path(__file__).parent.parent / "benchmarks" / "interrupt.py"))
     kinds = ("parent", "worker", "interrupt")
     assert interrupt["strike_often"](kinds, 1).keys() == set(kinds)
+
+
+def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
+    pytest.importorskip("upath")
+    local = generate(config(photos), tmp_path / "set", workers=1).dataset
+    url = f"memory://bucket-{os.getpid()}/set"
+    for shards in (range(0, 1), range(1, 3)):
+        generate_part(config(photos), url, shards, workers=1)
+    assert merge(url).fingerprint == local.fingerprint
+    there = store.open_dataset(Path(url))  # as the command line has it
+    assert (there.image(7) == local.image(7)).all()
+    assert len(list(there.verify())) == 3
+    with pytest.raises(DataError, match="already holds a dataset"):
+        generate(config(photos), url, workers=1)
+    with pytest.raises(DataError, match="nosuch:.* cannot be reached"):
+        generate(config(photos), "nosuch://bucket/set", workers=1)

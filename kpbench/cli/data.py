@@ -16,7 +16,13 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 
 @click.command()
 @click.option("--n", "n", type=int, required=True, help="Number of images.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-data"), show_default=True)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("kpbench-data"),
+    show_default=True,
+    help="Folder, or a URL such as s3://bucket/name (pip install 'kpbench[remote]').",
+)
 @SEED
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
 @PATCHES
@@ -162,8 +168,9 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     from kpbench.card import overview
     from kpbench.store import open_dataset, write_atomic
 
-    sheet = overview(open_dataset(dataset), count, columns, tile_width)
-    target = out or dataset / "preview.png"
+    data = open_dataset(dataset)
+    sheet = overview(data, count, columns, tile_width)
+    target = out or data.path / "preview.png"
     write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
     click.echo(str(target))
 
