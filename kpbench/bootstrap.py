@@ -1,8 +1,9 @@
 """95 % intervals from a bootstrap over scenes: images of one scene are not independent, so scenes are drawn.
 
-With few scenes percentile intervals are too narrow: they lack the factor C/(C - 1) of a variance and the tails of
-Student's t. Both are put into the percentiles (Hesterberg 2015, "What teachers should know about the bootstrap",
-section on expanded percentiles).
+With few scenes percentile intervals are too narrow and off centre. They lack the factor C/(C - 1) of a variance and the
+tails of Student's t; both are put into the percentiles (Hesterberg 2015, "What teachers should know about the
+bootstrap", section on expanded percentiles). Bias and skewness shift the percentiles (BC_a: Efron 1987, "Better
+bootstrap confidence intervals").
 ``benchmarks/coverage.py`` measures how often the intervals hold the truth.
 """
 
@@ -13,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtr, ndtri, stdtrit
 
 from kpbench.keypoints import Float
 
@@ -34,7 +35,7 @@ def by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
 def intervals(
     sums: NDArray[Any], statistics: Callable[[Float], Mapping[str, Float]], resamples: int, seed: int
 ) -> dict[str, Interval | None]:
-    """Expanded percentile intervals of statistics of the summed rows, when rows are drawn with replacement.
+    """Expanded BC_a intervals of statistics of the summed rows, when rows are drawn with replacement.
 
     Drawing C scenes with replacement is drawing how often each *kind* of scene (equal sums) comes up, a multinomial;
     so a million scenes cost as much as the few hundred different ones among them.
@@ -61,19 +62,34 @@ def intervals(
         shuffled = np.repeat(kinds, many, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
         many = np.ones(MOST_KINDS, np.int64)
-    tail = _tail(len(sums))
     drawn = rng.multinomial(many.sum(), many / many.sum(), size=resamples)
+    total = many @ kinds
+    found, without = statistics(total), statistics(total - kinds)  # without one scene of each kind, for the skewness
     result: dict[str, Interval | None] = {}
     for name, values in statistics(drawn.astype(float) @ kinds).items():
         values = values[np.isfinite(values)]
-        low, high = np.quantile(values, [tail, 1 - tail]).tolist() if len(values) else (np.nan, np.nan)
+        levels = _levels(values, float(found[name]), without[name], many, len(sums))
+        low, high = np.quantile(values, levels).tolist() if len(values) else (np.nan, np.nan)
         result[name] = (low, high) if len(values) else None
     return result
 
 
-def _tail(scenes: int) -> float:
-    """The share of resamples to leave out at each end for 95 %: 0.025 for many scenes, less for few."""
-    return float(ndtr(stdtrit(scenes - 1, 0.025) * np.sqrt(scenes / (scenes - 1))))
+def _levels(values: Float, found: float, without: Float, many: Int, scenes: int) -> Float:
+    """The two percentiles that make a 95 % interval: 0.025 and 0.975 for many scenes, without bias and skewness.
+
+    ``values`` (R,) are those of the resamples, ``found`` is that of all scenes, ``without`` (K,) is that without one
+    scene of each kind, and ``many`` (K,) scenes are of the kind.
+    """
+    half = -stdtrit(scenes - 1, 0.025) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
+    fine = np.isfinite(without)
+    if not len(values) or not fine.any():
+        return np.asarray(ndtr(half))
+    below = np.mean(values < found) + np.mean(values == found) / 2
+    bias = ndtri(np.clip(below, 0.5 / len(values), 1 - 0.5 / len(values)))
+    change, weight = np.average(without[fine], weights=many[fine]) - without[fine], many[fine]
+    spread = float(weight @ change**2)
+    skew = float(weight @ change**3) / (6 * spread**1.5) if spread > 0 else 0.0
+    return np.asarray(ndtr(bias + (bias + half) / (1 - skew * (bias + half))))
 
 
 def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:

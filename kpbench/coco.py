@@ -1,20 +1,91 @@
-"""Truth from COCO keypoint annotations, for images that kpbench did not make. Results are read as predictions."""
+"""COCO keypoints: annotations as truth, for images that kpbench did not make, and results as predictions."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-from kpbench.errors import DataError
-from kpbench.keypoints import KEYPOINT_DTYPE, Truth, UInt8
+from kpbench.columns import from_table
+from kpbench.errors import DataError, PredictionsError
+from kpbench.keypoints import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
+from kpbench.pieces import cut, kind, parse, records, typed, without_gc
 
-__all__ = ["CocoDataset", "open_coco"]
+__all__ = ["CocoDataset", "coco_results", "open_coco"]
+
+Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
+Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]  # a patch ID plus 1
+Point = tuple[float, float, float]
+
+
+class Image(msgspec.Struct, gc=False):
+    """An entry of ``images``."""
+
+    id: Whole
+    file_name: str = ""
+    condition: str = ""
+    rung: float | None = None
+    scene_id: Whole | None = None
+
+
+class Annotation(msgspec.Struct, gc=False):
+    """An entry of ``annotations``: one keypoint with the radius of its disc."""
+
+    image_id: Whole
+    category_id: Category
+    keypoints: Point
+    radius: float | None = None
+    radius_major: float | None = None
+    radius_minor: float | None = None
+    axis_angle: float = 0.0
+    visible: float = 1.0
+
+
+class Info(msgspec.Struct):
+    """What the export of kpbench says of the dataset."""
+
+    fingerprint: str = ""
+
+
+class Annotations(msgspec.Struct):
+    """A COCO annotations file."""
+
+    images: list[Image]
+    annotations: list[Annotation]
+    info: Info = msgspec.field(default_factory=Info)
+
+
+class Result(msgspec.Struct, gc=False):
+    """An entry of a results file: one detection."""
+
+    image_id: Whole
+    category_id: Category
+    keypoints: Point
+    score: float
+
+
+EXPECTED = {
+    "axis_angle": "degrees",
+    "category_id": "a whole number from 1",
+    "condition": "a text",
+    "file_name": "a text",
+    "id": "a whole number of 0 or more",
+    "image_id": "a whole number of 0 or more",
+    "keypoints": "one keypoint [x, y, v] of numbers",
+    "radius": "a number of px",
+    "radius_major": "a number of px",
+    "radius_minor": "a number of px",
+    "rung": "a number",
+    "scene_id": "a whole number of 0 or more",
+    "score": "a finite number",
+    "visible": "a fraction",
+}
 
 
 @dataclass(frozen=True)
@@ -26,7 +97,7 @@ class CocoDataset:
     path : Path
         The annotations file.
     truth : Truth
-        With the SHA-256 of the annotations file as fingerprint.
+        With the fingerprint of the dataset that was exported, else the SHA-256 of the annotations file.
     files : tuple of str
         Names of the images, below the folder of the annotations file or its ``images`` folder; may be missing.
     """
@@ -37,7 +108,7 @@ class CocoDataset:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of the annotations file."""
+        """Of the dataset that ``kpbench export`` wrote, else the SHA-256 of the annotations file."""
         return self.truth.fingerprint
 
     @property
@@ -77,78 +148,126 @@ def open_coco(path: str | Path) -> CocoDataset:
     path = Path(path)
     try:
         data = path.read_bytes()
-        content = json.loads(data)
+        with without_gc():
+            content = _annotations(data)
+            truth = _truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
+            return CocoDataset(path, truth, tuple(image.file_name for image in content.images))
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path}: no JSON ({error})") from None
-    try:
-        truth = replace(_truth(content), fingerprint=hashlib.sha256(data).hexdigest())
-    except DataError as error:
+    except (DataError, PredictionsError) as error:
         raise DataError(f"{path}: {error}") from None
-    return CocoDataset(path, truth, tuple(str(entry.get("file_name", "")) for entry in content["images"]))
 
 
-def _truth(content: Any) -> Truth:
-    images, annotations = (_list(content, name) for name in ("images", "annotations"))
-    ids = [_whole(entry, "id", f"images[{n}]") for n, entry in enumerate(images)]
-    place = {image_id: n for n, image_id in enumerate(ids)}
-    if len(place) < len(ids):
-        raise DataError("two images share an id")
-    of_image: list[int] = []
-    keypoints = np.zeros(len(annotations), KEYPOINT_DTYPE)
-    for n, entry in enumerate(annotations):
-        where = f"annotations[{n}]"
-        image_id = _whole(entry, "image_id", where)
-        if image_id not in place:
-            raise DataError(f"{where}: image_id is {image_id}, but there is no such image")
-        of_image.append(place[image_id] if _keypoint(entry, where, keypoints[n : n + 1]) else -1)
-    image = np.array(of_image, np.int64)
-    order = np.argsort(image, kind="stable")[np.count_nonzero(image < 0) :]
-    rungs = [entry.get("rung") for entry in images]
-    return Truth(
-        image_id=np.array(ids, np.int64),
-        offsets=np.concatenate([[0], np.cumsum(np.bincount(image[order], minlength=len(ids)))]).astype(np.int64),
-        keypoints=keypoints[order],
-        condition=np.array([str(entry.get("condition", "")) for entry in images]),
-        rung=np.array([math.nan if r is None else _number(r, f"images[{n}]: rung") for n, r in enumerate(rungs)]),
-        scene_id=np.array([entry.get("scene_id", image_id) for entry, image_id in zip(images, ids, strict=True)]),
+def _annotations(data: bytes) -> Annotations:
+    try:
+        return msgspec.json.decode(data, type=Annotations)
+    except (ValueError, RecursionError):
+        content = parse(data, "the file")
+    if not isinstance(content, dict):
+        raise DataError(f"holds {kind(content)}, expected COCO annotations") from None
+    for name in ("images", "annotations"):
+        if not isinstance(content.get(name), list):
+            raise DataError(f"has no list {name!r}, expected COCO annotations") from None
+    info = content.get("info")
+    named = info.get("fingerprint") if isinstance(info, dict) else None
+    return Annotations(
+        typed(content["images"], Image, EXPECTED, lambda n: f"images[{n}]"),
+        typed(content["annotations"], Annotation, EXPECTED, lambda n: f"annotations[{n}]"),
+        Info(named if isinstance(named, str) else ""),
     )
 
 
-def _keypoint(entry: dict[str, Any], where: str, row: Any) -> bool:
-    """Fill a row of the table; False for a keypoint that is not labelled."""
-    point = entry.get("keypoints")
-    if not isinstance(point, list) or len(point) != 3:
-        raise DataError(f"{where}: keypoints is {str(point)[:60]}, expected one keypoint [x, y, v]")
-    x, y, visibility = (_number(value, f"{where}: a number of keypoints") for value in point)
-    major = entry.get("radius_major", entry.get("radius"))
-    if major is None:
+def _truth(content: Annotations, fingerprint: str) -> Truth:
+    images, annotations = content.images, content.annotations
+    ids = np.array([image.id for image in images], np.int64)
+    sorter = np.argsort(ids, kind="stable")
+    if np.any(np.diff(ids[sorter]) == 0):
+        raise DataError("two images share an id")
+    named = np.array([entry.image_id for entry in annotations], np.int64)
+    keypoints, labelled = _keypoints(annotations)
+    place = np.searchsorted(ids, named, sorter=sorter)
+    unknown = np.append(ids[sorter], -1)[place] != named
+    if unknown.any():
+        n = int(np.argmax(unknown))
+        raise DataError(f"annotations[{n}]: image_id is {named[n]}, but there is no such image")
+    image = sorter[place[labelled]]
+    order = np.argsort(image, kind="stable")
+    return Truth(
+        image_id=ids,
+        offsets=offsets_of(np.bincount(image, minlength=len(ids))),
+        keypoints=keypoints[labelled][order],
+        condition=np.array([image.condition for image in images], np.str_),
+        rung=np.array([np.nan if image.rung is None else image.rung for image in images]),
+        scene_id=np.array([image.id if image.scene_id is None else image.scene_id for image in images], np.int64),
+        fingerprint=fingerprint,
+    )
+
+
+def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """The table of all annotations, and which of them are labelled."""
+    table = np.zeros(len(annotations), KEYPOINT_DTYPE)
+    points = np.fromiter(chain.from_iterable([a.keypoints for a in annotations]), np.float64).reshape(-1, 3)
+    table["x"], table["y"] = points[:, 0], points[:, 1]
+    table["patch_id"] = [a.category_id - 1 for a in annotations]
+    major = [a.radius if a.radius_major is None else a.radius_major for a in annotations]
+    if None in major:
         raise DataError(
-            f"{where}: has no radius, expected the disc's in px as radius, or radius_major and radius_minor"
+            f"annotations[{major.index(None)}] (image_id {annotations[major.index(None)].image_id}): has no radius, "
+            "expected the disc's in px as radius, or radius_major and radius_minor"
         )
-    row["x"], row["y"], row["patch_id"] = x, y, _whole(entry, "category_id", where) - 1
-    row["radius_major"] = _number(major, f"{where}: radius")
-    row["radius_minor"] = _number(entry.get("radius_minor", major), f"{where}: radius_minor")
-    row["axis_angle"], row["visible"] = entry.get("axis_angle", 0.0), entry.get("visible", 1.0)
-    return visibility > 0
+    table["radius_major"] = major
+    minor = [a.radius_minor for a in annotations]
+    table["radius_minor"] = (
+        major if all(m is None for m in minor) else [a if b is None else b for a, b in zip(major, minor, strict=True)]
+    )
+    table["axis_angle"] = [a.axis_angle for a in annotations]
+    table["visible"] = [a.visible for a in annotations]
+    fine = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
+    if not fine.all():
+        n = int(np.argmin(fine))
+        raise DataError(
+            f"annotations[{n}] (image_id {annotations[n].image_id}): keypoints are {points[n].tolist()} and the radius "
+            f"is {table['radius_major'][n]}, expected finite numbers"
+        )
+    return table, points[:, 2] > 0
 
 
-def _list(content: Any, name: str) -> list[dict[str, Any]]:
-    value = content.get(name) if isinstance(content, dict) else None
-    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise DataError(f"has no list {name!r} of objects, expected COCO annotations")
-    return value
+def coco_results(data: bytes) -> Predictions:
+    """COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``, as predictions.
+
+    Each entry is one detection with one keypoint, whose visibility v is ignored; its patch ID is the category ID less
+    1, as ``kpbench export --format coco`` numbers them. Images without detections are not listed in such a file.
+
+    Raises
+    ------
+    PredictionsError
+        Naming the first entry that does not fit, and its image.
+    """
+
+    def place(n: int) -> str:
+        return f"results[{n}]"
+
+    try:
+        frame, pieces = cut(data, r"^\s*\[")
+        if frame != []:
+            raise ValueError
+        parts = [_detections(batch) for batch in records(pieces, Result, EXPECTED, place)]
+    except (ValueError, RecursionError):  # entries may hold objects: read it whole, which also says what is wrong
+        entries = parse(data, "the file")
+        if not isinstance(entries, list):
+            raise PredictionsError(f"holds {kind(entries)}, expected a list of COCO keypoint results") from None
+        parts = [_detections(typed(entries, Result, EXPECTED, place))]
+    columns = map(np.concatenate, zip(_detections([]), *parts, strict=True))
+    return from_table(dict(zip(("image_id", "id", "score", "x", "y"), columns, strict=True)), {}, place)
 
 
-def _whole(entry: dict[str, Any], name: str, where: str) -> int:
-    value = entry.get(name)
-    if type(value) is not int or not 0 <= value < 2**63:
-        raise DataError(f"{where}: {name} is {str(value)[:60]}, expected a whole number of 0 or more")
-    return value
-
-
-def _number(value: Any, what: str) -> float:
-    if type(value) not in (int, float) or not math.isfinite(value):
-        raise DataError(f"{what} is {str(value)[:60]}, expected a finite number")
-    return float(value)
+def _detections(batch: list[Result]) -> tuple[NDArray[Any], ...]:
+    """Columns ``image_id, id, score, x, y`` of some results."""
+    points = np.fromiter(chain.from_iterable([r.keypoints for r in batch]), np.float64, 3 * len(batch)).reshape(-1, 3)
+    return (
+        np.array([r.image_id for r in batch], np.int64),
+        np.array([r.category_id for r in batch], np.float64) - 1,
+        np.array([r.score for r in batch], np.float64),
+        points[:, 0],
+        points[:, 1],
+    )

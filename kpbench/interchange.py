@@ -116,7 +116,7 @@ def _coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         {"id": i + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
         for i, name in _names(dataset).items()
     ]
-    info = {"description": f"kpbench dataset {dataset.fingerprint}"}
+    info = {"description": "kpbench dataset", "fingerprint": dataset.fingerprint}  # checked when scoring
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
     write_atomic(folder / "annotations.json", json.dumps(content).encode())
     return folder / "annotations.json"

@@ -1,4 +1,4 @@
-"""The two tables that pass between the stages: true keypoints and detections.
+"""The tables that pass between the stages: true keypoints, and detections in one image and in many.
 
 They are defined here, below everything that makes or reads them, so that the evaluator never
 needs the generator.
@@ -6,14 +6,19 @@ needs the generator.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["KEYPOINT_DTYPE", "Detections", "Float", "Truth", "UInt8"]
+from kpbench.errors import PredictionsError
 
+__all__ = ["KEYPOINT_DTYPE", "Detections", "Float", "Int", "Misfit", "Predictions", "Truth", "UInt8", "offsets_of"]
+
+Int = NDArray[np.int64]
 Float = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]
 
@@ -104,3 +109,135 @@ class Truth:
 
     def __len__(self) -> int:
         return len(self.image_id)
+
+
+class Misfit(PredictionsError):
+    """A value that cannot be: in which image (position), at which keypoint of it (or None), and why."""
+
+    def __init__(self, image: int, keypoint: int | None, image_id: int, problem: str) -> None:
+        super().__init__(f"predictions[{image}] (image_id {image_id}): {problem}")
+        self.image, self.keypoint, self.image_id, self.problem = image, keypoint, image_id, problem
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Detections of N images as columns; image ``i`` owns rows ``offsets[i]:offsets[i + 1]``.
+
+    Attributes
+    ----------
+    image_id : ndarray of shape (N,), int64, unique, 0 or more, in any order.
+    offsets : ndarray of shape (N + 1,), int64.
+    xy : ndarray of shape (K, 2), float64, px in the pixel convention of :mod:`kpbench.geometry`.
+    score : ndarray of shape (K,), float64, higher is surer.
+    patch_id : ndarray of shape (K,), int64, 0 or more, or None from a detector that tells no identities.
+    detector : dict
+        Whatever names the detector, such as ``{"name": "superpoint", "version": "1"}``.
+    dataset : str or None
+        Path or fingerprint of the dataset.
+    fingerprint : str or None
+        Fingerprint of the dataset, checked when scoring.
+
+    Raises
+    ------
+    PredictionsError
+        If the columns do not fit each other or hold a value that cannot be; it names image and keypoint.
+    """
+
+    image_id: Int
+    offsets: Int
+    xy: Float
+    score: Float
+    patch_id: Int | None = None
+    detector: dict[str, Any] = field(default_factory=dict)
+    dataset: str | None = None
+    fingerprint: str | None = None
+
+    def __post_init__(self) -> None:
+        set_ = object.__setattr__
+        set_(self, "image_id", np.ascontiguousarray(self.image_id, np.int64).reshape(-1))
+        set_(self, "offsets", np.ascontiguousarray(self.offsets, np.int64).reshape(-1))
+        set_(self, "xy", np.ascontiguousarray(self.xy, np.float64).reshape(-1, 2))
+        set_(self, "score", np.ascontiguousarray(self.score, np.float64).reshape(-1))
+        if self.patch_id is not None:
+            set_(self, "patch_id", np.ascontiguousarray(self.patch_id, np.int64).reshape(-1))
+        _check(self)
+
+    def __len__(self) -> int:
+        return len(self.image_id)
+
+    @classmethod
+    def from_detections(
+        cls,
+        detections: Iterable[Detections],
+        image_id: Sequence[int] | Int | None = None,
+        detector: dict[str, Any] | None = None,
+        dataset: str | None = None,
+        fingerprint: str | None = None,
+    ) -> Predictions:
+        """One :class:`Detections` an image, to columns; ``image_id`` is 0, 1, 2, … where it is not given.
+
+        Raises
+        ------
+        PredictionsError
+            As the class does, and if some images with detections have identities and others have none.
+        """
+        found = list(detections)
+        named = [d.patch_id is not None for d in found if len(d)]
+        if any(named) and not all(named):
+            raise PredictionsError("some images have ids and others have none; give ids to all detections or to none")
+        ids = [d.patch_id for d in found if d.patch_id is not None and len(d)]
+        return cls(
+            image_id=np.arange(len(found)) if image_id is None else np.asarray(image_id, np.int64),
+            offsets=offsets_of([len(d) for d in found]),
+            xy=np.concatenate([np.zeros((0, 2)), *(d.xy for d in found)]),
+            score=np.concatenate([np.zeros(0), *(d.score for d in found)]),
+            patch_id=np.concatenate([np.zeros(0, np.int64), *ids]) if all(named) else None,
+            detector=detector or {},
+            dataset=dataset,
+            fingerprint=fingerprint,
+        )
+
+    def detections(self) -> list[Detections]:
+        """The same as one :class:`Detections` an image, in the order of ``image_id``."""
+        return [
+            Detections(self.xy[a:b], self.score[a:b], None if self.patch_id is None else self.patch_id[a:b])
+            for a, b in pairwise(self.offsets.tolist())
+        ]
+
+
+def offsets_of(counts: Sequence[int] | Int) -> Int:
+    """Where each image's rows begin, and where the last one's end: (N + 1,) from (N,) counts."""
+    return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
+
+
+def _check(p: Predictions) -> None:
+    """Every rule that the numbers must keep, for all formats and for arrays made in memory."""
+    n, k = len(p.image_id), len(p.xy)
+    if len(p.offsets) != n + 1 or p.offsets[0] != 0 or p.offsets[-1] != k or np.any(np.diff(p.offsets) < 0):
+        raise PredictionsError(f"offsets do not run from 0 to {k} keypoints in {n} images")
+    if len(p.score) != k or (p.patch_id is not None and len(p.patch_id) != k):
+        ids = k if p.patch_id is None else len(p.patch_id)
+        raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {ids} ids do not belong together")
+
+    def complain(row: int, name: str, value: object, expected: str) -> NoReturn:
+        image = int(np.searchsorted(p.offsets, row, side="right")) - 1
+        keypoint = row - int(p.offsets[image])
+        raise Misfit(image, keypoint, int(p.image_id[image]), f"{name}[{keypoint}] is {value}, expected {expected}")
+
+    if n and p.image_id.min() < 0:
+        i = int(np.argmax(p.image_id < 0))
+        raise Misfit(i, None, int(p.image_id[i]), "image_id is negative, expected 0 or more")
+    order = np.argsort(p.image_id, kind="stable")
+    again = np.flatnonzero(np.diff(p.image_id[order]) == 0)
+    if len(again):
+        first, second = order[again[0]], order[again[0] + 1]
+        raise Misfit(int(second), None, int(p.image_id[second]), f"the image is there twice, first at {first}")
+    if not np.isfinite(p.xy).all():
+        row = int(np.argmin(np.isfinite(p.xy).all(axis=1)))
+        complain(row, "keypoints", p.xy[row].tolist(), "two finite numbers")
+    if not np.isfinite(p.score).all():
+        row = int(np.argmin(np.isfinite(p.score)))
+        complain(row, "scores", p.score[row].item(), "a finite number")
+    if p.patch_id is not None and k and p.patch_id.min() < 0:
+        row = int(np.argmax(p.patch_id < 0))
+        complain(row, "ids", p.patch_id[row].item(), "a patch id, 0 or more")

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from kpbench import degrade, store
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections, UInt8
-from kpbench.predictions import Predictions
+from kpbench.keypoints import Detections, Predictions, UInt8
 from kpbench.preview import draw_detections
 from kpbench.scene import stream
 from kpbench.sources import Source, image_writer

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import orjson
+import msgspec
 
 from kpbench.breakpoints import breakpoints
 from kpbench.charts import STYLE
@@ -288,7 +288,7 @@ def scores_file(scores: Scores, known: Mapping[str, Any]) -> bytes:
 
 
 def _json(content: Mapping[str, Any]) -> bytes:
-    return orjson.dumps(content, option=orjson.OPT_INDENT_2 | orjson.OPT_APPEND_NEWLINE)
+    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
 
 
 def comparison_file(comparisons: Sequence[Comparison], known: Mapping[str, Any]) -> bytes:

@@ -26,9 +26,8 @@ from numpy.typing import NDArray
 from kpbench.assignment import MATCHED, matched_within
 from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import GateFailed, PredictionsError
-from kpbench.keypoints import Detections, Truth
+from kpbench.keypoints import Detections, Predictions, Truth
 from kpbench.metrics import COUNTS, METRICS, SUMS, error_metrics, precision_recall, ratios
-from kpbench.predictions import Predictions
 from kpbench.tally import Settings, Tally, tally
 
 __all__ = ["Group", "Scores", "check_gates", "evaluate", "score", "summarise"]

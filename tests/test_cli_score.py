@@ -1,5 +1,6 @@
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
@@ -245,9 +246,20 @@ def test_coco_truth_scores_as_the_dataset_that_it_was_exported_from(here):
     for image in (here / "coco" / "images").iterdir():
         image.unlink()
     assert "r.html shows no images" in kpbench("p.json", "--gt", "coco/annotations.json", "--report", "r.html").stderr
-    assert json.loads((here / "b.json").read_text())["dataset"]["fingerprint"] == sha256_of(
-        here / "coco/annotations.json"
-    )
+    assert json.loads((here / "b.json").read_text())["dataset"]["fingerprint"] == data.fingerprint
+
+
+def test_the_coco_export_is_known_by_its_datasets_fingerprint(here):
+    data = write_dataset(here / "kpbench-data", IMAGES)
+    export_dataset(data, "coco", here / "coco")
+    write_predictions("p.json", replace(perfect(), fingerprint=data.fingerprint))
+    kpbench("p.json", "--gt", "coco/annotations.json")
+    write_predictions("p.json", replace(perfect(), fingerprint="a" * 64))
+    assert "made for the dataset with fingerprint aaaaaaaaaaaa" in complaint("p.json", "--gt", "coco/annotations.json")
+    content = json.loads((here / "coco/annotations.json").read_text())
+    (here / "other.json").write_text(json.dumps(content | {"info": {"description": "of another tool"}}))
+    write_predictions("p.json", replace(perfect(), fingerprint=sha256_of(here / "other.json")))
+    kpbench("p.json", "--gt", "other.json")
 
 
 def test_coco_truth_with_one_radius_and_results(here):
@@ -275,12 +287,15 @@ def test_coco_truth_with_one_radius_and_results(here):
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"radius": None}, "annotations[0]: has no radius"),
-        ({"radius": "4"}, "annotations[0]: radius is 4, expected a finite number"),
-        ({"keypoints": [1, 2]}, "annotations[0]: keypoints is [1, 2], expected one keypoint [x, y, v]"),
-        ({"keypoints": [1, None, 2]}, "annotations[0]: a number of keypoints is None"),
+        ({"radius": None}, "annotations[0] (image_id 0): has no radius"),
+        ({"radius": "4"}, "annotations[0] (image_id 0): radius is '4', expected a number of px"),
+        ({"keypoints": [1, 2]}, "annotations[0] (image_id 0): keypoints is [1, 2], expected one keypoint [x, y, v]"),
+        (
+            {"keypoints": [1, None, 2]},
+            "annotations[0] (image_id 0): keypoints is [1, None, 2], expected one keypoint [x, y, v]",
+        ),
         ({"image_id": 4}, "annotations[0]: image_id is 4, but there is no such image"),
-        ({"category_id": "1"}, "annotations[0]: category_id is 1, expected a whole number"),
+        ({"category_id": "1"}, "annotations[0] (image_id 0): category_id is '1', expected a whole number from 1"),
     ],
 )
 def test_bad_coco_truth_is_one_line(here, change, problem):
@@ -290,7 +305,10 @@ def test_bad_coco_truth_is_one_line(here, change, problem):
     assert complaint("p.json", "--gt", "gt.json").startswith(f"kpbench: gt.json: {problem}")
 
 
-@pytest.mark.parametrize(("text", "problem"), [("{", "no JSON"), ("[]", "has no list 'images' of objects")])
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [("{", "the file is cut off or no JSON"), ("[]", "holds a list"), ("{}", "has no list 'images'")],
+)
 def test_no_coco_truth_is_one_line(here, text, problem):
     (here / "gt.json").write_text(text)
     write_predictions("p.json", perfect([[]]))

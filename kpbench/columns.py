@@ -1,0 +1,254 @@
+"""Predictions as tables: CSV and Parquet with one row a keypoint, HDF5 with one dataset a column."""
+
+from __future__ import annotations
+
+import csv
+import importlib
+import io
+import json
+import math
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.errors import PredictionsError
+from kpbench.header import header_of, read_header
+from kpbench.keypoints import Predictions, offsets_of
+from kpbench.pieces import parse, short
+
+__all__ = ["COLUMNS", "from_table", "read_csv", "read_h5", "read_parquet", "write_csv", "write_h5", "write_parquet"]
+
+COLUMNS = ("image_id", "x", "y", "score", "id")
+H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
+
+
+def from_table(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
+    """Columns from one row a keypoint, in any order; a row with nothing but an image_id is an image without any."""
+    values = np.stack([table[name].astype(np.float64) for name in COLUMNS[1:] if name in table], axis=1)
+    rows = np.flatnonzero(~np.isnan(values).all(axis=1))
+    for name in COLUMNS[1:]:
+        column = table[name][rows] if name in table else np.zeros(0)
+        fine = np.isfinite(column)
+        if name == "id":
+            fine &= (column >= 0) & (column == np.floor(column)) & (column < 2**53)
+        if not fine.all():
+            row = int(rows[np.argmin(fine)])
+            expected = "a patch id, a whole number of 0 or more" if name == "id" else "a finite number"
+            value = table[name][row]
+            raise PredictionsError(
+                f"{place(row)} (image_id {table['image_id'][row]}): {name} is "
+                f"{'blank' if math.isnan(value) else value}, expected {expected}"
+            )
+    if len(table["image_id"]) and table["image_id"].min() < 0:
+        row = int(np.argmax(table["image_id"] < 0))
+        raise PredictionsError(f"{place(row)}: image_id is {table['image_id'][row]}, expected 0 or more")
+    image_id, image = np.unique(table["image_id"], return_inverse=True)
+    rows = rows[np.argsort(image[rows], kind="stable")]
+    return Predictions(
+        image_id=image_id,
+        offsets=offsets_of(np.bincount(image[rows], minlength=len(image_id))),
+        xy=np.stack([table["x"][rows], table["y"][rows]], axis=1),
+        score=table["score"][rows] if "score" in table else np.ones(len(rows)),
+        patch_id=table["id"][rows].astype(np.int64) if "id" in table else None,
+        **header,
+    )
+
+
+def _table(p: Predictions) -> dict[str, NDArray[Any]]:
+    """One row a keypoint, and one blank row for an image without any."""
+    counts = np.diff(p.offsets)
+    image = np.repeat(np.arange(len(p)), np.maximum(counts, 1))
+    blank = counts[image] == 0
+    columns: dict[str, NDArray[Any]] = {"image_id": p.image_id[image]}
+    for name, values in (("x", p.xy[:, 0]), ("y", p.xy[:, 1]), ("score", p.score), ("id", p.patch_id)):
+        if values is not None:
+            columns[name] = np.full(len(image), np.nan)
+            columns[name][~blank] = values
+    return columns
+
+
+# --- CSV -----------------------------------------------------------------------------------------------------------
+
+
+def read_csv(path: Path) -> Predictions:
+    """Read ``.csv``: one row a keypoint, and maybe the header behind a ``#`` in the first line."""
+    import pandas as pd
+
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        first = file.readline()
+        header = {}
+        skipped = 0
+        if first.startswith("#"):
+            header = read_header(parse(first[1:].encode(), "line 1, after #,"))
+            first, skipped = file.readline(), 1
+    names = _columns(next(csv.reader([first]), []), f"line {1 + skipped}")
+
+    def place(row: int) -> str:
+        return f"line {row + 2 + skipped}"
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # pandas 3.1 deprecates float_precision, pandas 2 is inexact without
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # a row that is too long is only a warning
+            table = pd.read_csv(
+                path,
+                skiprows=skipped,
+                index_col=False,
+                dtype={name: np.int64 if name == "image_id" else np.float64 for name in names},
+                float_precision="round_trip",
+                keep_default_na=False,
+                na_values=[""],
+                skip_blank_lines=False,
+                encoding="utf-8-sig",
+            )
+    except (ValueError, Warning) as error:  # pandas' parser errors are ValueErrors
+        raise _first_bad_row(path, skipped, names, place, error) from None
+    return from_table({name: table[name].to_numpy() for name in names}, header, place)
+
+
+def _columns(names: list[str], place: str) -> list[str]:
+    names = [name.strip() for name in names]
+    if not {"image_id", "x", "y"} <= set(names) <= set(COLUMNS) or len(set(names)) < len(names):
+        raise PredictionsError(
+            f"{place} has columns {','.join(names)[:80]}, expected {','.join(COLUMNS)} (score, id optional)"
+        )
+    return names
+
+
+def _first_bad_row(
+    path: Path, skipped: int, names: list[str], place: Callable[[int], str], error: BaseException
+) -> PredictionsError:
+    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
+        for row, cells in enumerate(csv.reader(file), -1 - skipped):
+            if row < 0:
+                continue
+            if len(cells) != len(names):
+                return PredictionsError(f"{place(row)} has {len(cells)} values, expected {len(names)}")
+            for name, cell in zip(names, cells, strict=True):
+                try:
+                    value = int(cell) if name == "image_id" else float(cell or 0)
+                    fine = abs(value) < 2**63 if name == "image_id" else math.isfinite(value)
+                except ValueError:
+                    fine = False
+                if not fine:
+                    expected = "a whole number" if name in ("image_id", "id") else "a finite number"
+                    return PredictionsError(f"{place(row)}: {name} is {short(cell)}, expected {expected}")
+    return PredictionsError(f"no table ({' '.join(str(error).split())[:120]})")
+
+
+def write_csv(p: Predictions) -> bytes:
+    """The text of a ``.csv`` file."""
+    import pandas as pd
+
+    frame = pd.DataFrame(_table(p))
+    if "id" in frame:
+        frame["id"] = frame["id"].astype("Int64")
+    text = io.StringIO()
+    text.write(f"# {json.dumps(header_of(p), ensure_ascii=False)}\n")
+    frame.to_csv(text, index=False, lineterminator="\n")
+    return text.getvalue().encode()
+
+
+# --- Parquet -------------------------------------------------------------------------------------------------------
+
+
+def read_parquet(path: Path) -> Predictions:
+    """Read ``.parquet``: the columns of CSV, the header in the metadata."""
+    pa, pq = _pyarrow()
+    try:
+        table = pq.read_table(path)
+    except (pa.ArrowException, ValueError) as error:
+        raise PredictionsError(f"damaged or no Parquet file ({' '.join(str(error).split())[:120]})") from None
+    metadata = table.schema.metadata or {}
+    header = read_header(parse(metadata[b"kpbench"], "the metadata")) if b"kpbench" in metadata else {}
+    names = _columns(table.column_names, "the table")
+    columns = {}
+    for name in names:
+        whole = name == "image_id"
+        try:
+            column = table.column(name).cast(pa.int64() if whole else pa.float64())
+            if whole and column.null_count:
+                raise ValueError("it has nulls")
+            columns[name] = column.to_numpy()
+        except (pa.ArrowException, ValueError) as error:
+            raise PredictionsError(f"column {name} holds no plain numbers ({str(error)[:80]})") from None
+    return from_table(columns, header, lambda row: f"row {row}")
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        raise PredictionsError("Parquet needs pyarrow: pip install pyarrow") from None
+
+
+def write_parquet(p: Predictions) -> bytes:
+    """The bytes of a ``.parquet`` file."""
+    pa, pq = _pyarrow()
+    types = {name: pa.int64() if name in ("image_id", "id") else pa.float64() for name in COLUMNS}
+    columns = {name: pa.array(v, types[name], from_pandas=True) for name, v in _table(p).items()}
+    table = pa.table(columns).replace_schema_metadata({"kpbench": json.dumps(header_of(p))})
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return bytes(sink.getvalue())
+
+
+# --- HDF5 ----------------------------------------------------------------------------------------------------------
+
+
+def read_h5(path: Path) -> Predictions:
+    """Read ``.h5``: a dataset a column, the header in an attribute."""
+    import h5py
+
+    columns: dict[str, NDArray[Any]] = {}
+    try:
+        with h5py.File(path, "r", locking="best-effort") as file:
+            header = {}
+            if "header" in file.attrs:
+                header = read_header(parse(str(file.attrs["header"]).encode(), "the attribute header"))
+            for name in sorted(set(file) - H5_COLUMNS.keys()):
+                raise PredictionsError(f"unknown dataset /{name}, expected {', '.join(H5_COLUMNS)}")
+            for name, kind in H5_COLUMNS.items():
+                if name not in file and name in ("score", "id"):
+                    continue
+                if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+                    raise PredictionsError(f"/{name} is missing or a link to elsewhere")
+                data = file[name]
+                # A file may name other files of this machine, or declare more than it holds
+                if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
+                    raise PredictionsError(f"/{name} is not stored in this file")
+                if data.nbytes > 1100 * data.id.get_storage_size():
+                    raise PredictionsError(f"/{name} declares {data.nbytes} bytes, the file holds fewer")
+                if data.dtype.kind not in (kind + "u" if kind == "i" else "fi") or data.ndim != 1 + (name == "xy"):
+                    raise PredictionsError(f"/{name} is {data.dtype} of shape {data.shape}, expected {kind}8 columns")
+                columns[name] = data[:]
+    except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+        raise PredictionsError(f"damaged or no HDF5 file ({' '.join(str(error).split())[:120]})") from None
+    if columns["xy"].shape[1:] != (2,):
+        raise PredictionsError(f"/xy has shape {columns['xy'].shape}, expected (K, 2)")
+    return Predictions(
+        image_id=columns["image_id"],
+        offsets=columns["offsets"],
+        xy=columns["xy"],
+        score=columns.get("score", np.ones(len(columns["xy"]))),
+        patch_id=columns.get("id"),
+        **header,
+    )
+
+
+def write_h5(p: Predictions) -> bytes:
+    """The bytes of an ``.h5`` file."""
+    import h5py
+
+    with h5py.File.in_memory() as file:
+        file.attrs["header"] = json.dumps(header_of(p))
+        columns = {"image_id": p.image_id, "offsets": p.offsets, "xy": p.xy, "score": p.score, "id": p.patch_id}
+        for name, values in columns.items():
+            if values is not None:
+                file.create_dataset(name, data=values)
+        file.flush()
+        return bytes(file.id.get_file_image())
