@@ -231,5 +231,5 @@ def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
     assert len(list(there.verify())) == 3
     with pytest.raises(DataError, match="already holds a dataset"):
         generate(config(photos), url, workers=1)
-    with pytest.raises(DataError, match="nosuch:.* cannot be reached"):
+    with pytest.raises(DataError, match=r"nosuch:.* cannot be reached"):
         generate(config(photos), "nosuch://bucket/set", workers=1)
