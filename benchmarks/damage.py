@@ -2,7 +2,7 @@
 
     python benchmarks/damage.py [--flips 500] [--cuts 100]
 
-A small dataset is made; at evenly spaced positions of its shard one byte is inverted, and it is read to the end. Counted
+A small dataset is made; at evenly spaced positions of its shard one byte is inverted, and it is read. Counted
 is what `kpbench verify` says and what reading all images and columns says without it: "refused" with a one-line
 DataError, or "same", all values as they were (the byte is padding, or in `/background`, which is for people).
 """
