@@ -64,7 +64,7 @@ def _of_condition(scores: Scores, name: str, rungs: list[float], limit: float) -
     under = score < limit
     if np.isfinite(score).all() and (under.all() or not under.any()):
         yield Breakpoint(name, limit, "under" if under[0] else "over", None, None)
-    for crossing, rising in (("falls", False), ("rises", True)):
+    for crossing, rising in (("falls", False), ("rises", True)) if len(levels) > 1 else ():
         at = float(_first_crossing(levels, score, limit, rising))
         if np.isnan(at):
             continue

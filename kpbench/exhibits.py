@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-
-import numpy as np
+from dataclasses import astuple, dataclass
 
 from kpbench.breakpoints import LIMIT, Breakpoint, breakpoints
 from kpbench.charts import Series, bar_chart, line_chart
@@ -13,7 +11,7 @@ from kpbench.comparison import METRICS as COMPARED
 from kpbench.comparison import Comparison
 from kpbench.metrics import LABELS, PAPER_METRICS
 from kpbench.paper import PAPER, SYNTHETIC, PaperTable, paper_value
-from kpbench.pose import PoseErrors
+from kpbench.pose import PoseGroup
 from kpbench.scoring import Group, Scores
 from kpbench.tables import Cell, Estimate, Table
 
@@ -239,19 +237,13 @@ def difference_table(comparison: Comparison) -> Table:
     return Table(title, ("condition", "rung", *names), tuple((*key, *cells) for key, cells in at.items()))
 
 
-def pose_table(run: Scores, errors: PoseErrors) -> Table:
+def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
     """Errors of the board's pose: a row for all images and for each condition and rung."""
-    truth = run.tally.truth
-    keys = [("all", "all", np.ones(len(truth), bool))]
-    for name, rungs in run.conditions.items():
-        keys += [(name, f"{r:g}", (truth.condition == name) & (truth.rung == r)) for r in rungs]
-    rows: list[tuple[Cell, ...]] = []
-    for condition, rung, chosen in keys:
-        cells: list[Cell] = [condition, rung, int(chosen.sum()), int(np.isfinite(errors.rotation_deg[chosen]).sum())]
-        for values in (errors.translation_percent[chosen], errors.rotation_deg[chosen]):
-            known = values[np.isfinite(values)]
-            cells += np.percentile(known, [50, 95]).tolist() if len(known) else [None, None]
-        rows.append(tuple(cells))
+    rows = []
+    for group in groups:
+        _, _, *cells = astuple(group)
+        rung = "all" if group.rung is None else f"{group.rung:g}"
+        rows.append((group.condition or "all", rung, *cells))
     spread = ("median", "95th percentile")
     errors_of = [f"{what}, {part}" for what in ("translation (%)", "rotation (°)") for part in spread]
     columns = ("condition", "rung", "images", "with a pose", *errors_of)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.geometry import Camera
 from kpbench.keypoints import Float
+from kpbench.scoring import Scores
 from kpbench.tally import Tally
 
-__all__ = ["PoseErrors", "pose_errors"]
+__all__ = ["PoseErrors", "PoseGroup", "pose_errors", "pose_groups"]
 
 LEAST_POINTS = 4  # that fix the pose of a plane
 
@@ -30,6 +32,47 @@ class PoseErrors:
 
     translation_percent: Float
     rotation_deg: Float
+
+
+@dataclass(frozen=True)
+class PoseGroup:
+    """Errors of the pose over all images (condition and rung None) or those of one rung; None without any pose.
+
+    Attributes
+    ----------
+    condition : str or None
+    rung : float or None
+    images, with_pose : int
+        Images of the group, and those whose pose is known.
+    translation_median_percent, translation_p95_percent : float or None
+    rotation_median_deg, rotation_p95_deg : float or None
+    """
+
+    condition: str | None
+    rung: float | None
+    images: int
+    with_pose: int
+    translation_median_percent: float | None
+    translation_p95_percent: float | None
+    rotation_median_deg: float | None
+    rotation_p95_deg: float | None
+
+
+def pose_groups(run: Scores, errors: PoseErrors) -> tuple[PoseGroup, ...]:
+    """Median and 95th percentile of the errors, over all images and for each condition and rung."""
+    truth = run.tally.truth
+
+    def group(condition: str | None, rung: float | None, chosen: NDArray[np.bool_]) -> PoseGroup:
+        known = chosen & np.isfinite(errors.rotation_deg)
+        both = errors.translation_percent[known], errors.rotation_deg[known]
+        spread = [v for e in both for v in (np.percentile(e, [50, 95]).tolist() if len(e) else (None, None))]
+        return PoseGroup(condition, rung, int(chosen.sum()), int(known.sum()), *spread)
+
+    rungs = [(name, r) for name, ladder in run.conditions.items() for r in ladder]
+    return (
+        group(None, None, np.ones(len(truth), bool)),
+        *(group(name, r, (truth.condition == name) & (truth.rung == r)) for name, r in rungs),
+    )
 
 
 def pose_errors(rows: Tally, points_mm: Float, camera: Camera) -> PoseErrors:

@@ -10,7 +10,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +39,7 @@ from kpbench.exhibits import (
     verdict_table,
 )
 from kpbench.paper import PAPER
+from kpbench.pose import PoseGroup
 from kpbench.scoring import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
@@ -282,9 +283,12 @@ def provenance(
     }
 
 
-def scores_file(scores: Scores, known: Mapping[str, Any]) -> bytes:
-    """The scores file (``kpbench.scores/1``): all numbers, the breakpoints, and the provenance."""
-    return _json(scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)], "provenance": known})
+def scores_file(scores: Scores, known: Mapping[str, Any], poses: Sequence[PoseGroup] = ()) -> bytes:
+    """The scores file (``kpbench.scores/1``): all numbers, the breakpoints, errors of the pose, and the provenance."""
+    content = scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)]}
+    if poses:
+        content["pose"] = [asdict(group) for group in poses]
+    return _json(content | {"provenance": known})
 
 
 def _json(content: Mapping[str, Any]) -> bytes:

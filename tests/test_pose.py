@@ -1,3 +1,8 @@
+import json
+from dataclasses import asdict, astuple, replace
+from pathlib import Path
+
+import jsonschema
 import numpy as np
 import pytest
 
@@ -5,7 +10,8 @@ from kpbench.errors import DataError
 from kpbench.exhibits import pose_table
 from kpbench.geometry import Camera
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
-from kpbench.pose import pose_errors
+from kpbench.pose import PoseErrors, pose_errors, pose_groups
+from kpbench.report import scores_file
 from kpbench.scoring import score
 from kpbench.suite import SuiteConfig, board_in_view, load_suite
 
@@ -55,6 +61,21 @@ def test_a_known_change_of_pose_is_the_error():
     assert e.rotation_deg == pytest.approx(2.0, abs=1e-3)
 
 
+def test_groups_are_percentiles_of_the_images_with_a_pose():
+    found = [Detections(seen(*pose)[:n], np.ones(n)) for pose, n in zip(TRUE, (6, 6, 3), strict=True)]
+    run = score(replace(truth_of(TRUE), condition=np.array(["a", "a", "b"]), rung=np.zeros(3)), found, resamples=0)
+    errors = PoseErrors(np.array([1.0, 3.0, np.nan]), np.array([2.0, 4.0, np.nan]))
+    everything, a, b = pose_groups(run, errors)
+    assert astuple(everything) == (None, None, 3, 2, 2.0, pytest.approx(2.9), 3.0, pytest.approx(3.9))
+    assert astuple(a) == ("a", 0, 2, 2, *astuple(everything)[4:])
+    assert astuple(b) == ("b", 0, 1, 0, None, None, None, None)
+    schema = json.loads((Path(__file__).parent.parent / "docs" / "schemas" / "scores-1.json").read_text())
+    content = json.loads(scores_file(run, {}, pose_groups(run, errors)))
+    jsonschema.Draft202012Validator(schema).validate(content)
+    assert content["pose"] == [asdict(group) for group in (everything, a, b)]
+    assert "pose" not in json.loads(scores_file(run, {}))
+
+
 def test_four_points_are_enough_and_three_are_none():
     found = [Detections(seen(*pose)[:n], np.ones(n)) for pose, n in zip(TRUE, (4, 3, 0), strict=True)]
     e = errors(found)
@@ -97,9 +118,13 @@ def test_a_suites_truth_is_its_board_seen_by_its_camera(board):
     scores = score(truth, exact, resamples=0)
     e = pose_errors(scores.tally, points, camera)
     assert np.nanmax(e.translation_percent) < 1e-3
-    table = pose_table(scores, e)
+    groups = pose_groups(scores, e)
+    rungs = sorted({s.rung for s in shots})
+    assert [(g.condition, g.rung) for g in groups] == [(None, None), *(("pitch", r) for r in rungs)]
+    assert (groups[0].images, groups[0].with_pose) == (n, n)
+    table = pose_table(scores, groups)
     assert table.rows[0][:4] == ("all", "all", n, n)
-    assert [row[1] for row in table.rows[1:]] == [f"{r:g}" for r in sorted({s.rung for s in shots})]
+    assert [row[1] for row in table.rows[1:]] == [f"{r:g}" for r in rungs]
 
 
 def test_other_datasets_have_no_board():

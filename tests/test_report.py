@@ -158,6 +158,8 @@ def test_a_breakpoint_lies_on_the_line_between_two_rungs(scores):
         ("falls", 1.5, None),
         ("rises", 2.5, None),
     ]
+    one_rung = [score(*ladder(share={1: share}), resamples=10) for share in (1.0, 0.5)]
+    assert [b.crossing for run in one_rung for b in breakpoints(run, 0.9)] == ["over", "under"]
 
 
 def test_a_breakpoints_interval_is_that_of_its_scenes():

@@ -14,6 +14,7 @@ from kpbench.cli.options import Finite
 if TYPE_CHECKING:
     from kpbench.coco import CocoDataset
     from kpbench.comparison import Comparison
+    from kpbench.pose import PoseGroup
     from kpbench.predictions import Predictions
     from kpbench.scoring import Scores
     from kpbench.store import Dataset
@@ -97,6 +98,7 @@ def score(
       kpbench score preds.json --report report.html
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
+    from kpbench.exhibits import pose_table
     from kpbench.report import provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
     from kpbench.store import write_atomic
@@ -104,18 +106,19 @@ def score(
 
     _check_report(report_file)
     dataset, (scores,) = _scored([preds], gt, how)
-    poses = (_poses(scores, dataset),) if pose else ()
+    poses = _poses(scores, dataset) if pose else ()
+    tables = [pose_table(scores, poses)] if poses else []
     known = provenance(dataset, [preds], ["kpbench", *sys.argv[1:]])
     if json_file:
-        write_atomic(json_file, scores_file(scores, known))
+        write_atomic(json_file, scores_file(scores, known, poses))
     if csv_file:
         write_atomic(csv_file, scores_csv(scores, known))
     if report_file:
-        _write_report(report_file, [scores], dataset, known, poses=poses)
+        _write_report(report_file, [scores], dataset, known, poses=tables)
     click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
     click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
     click.echo(_summary(scores))
-    for table in poses:
+    for table in tables:
         click.echo(f"\n{table.title}\n{to_plain(table)}")
     check_gates(scores, dict(least), dict(most))
 
@@ -198,16 +201,15 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
     return dataset, scores
 
 
-def _poses(scores: Scores, dataset: Dataset | CocoDataset) -> Table:
+def _poses(scores: Scores, dataset: Dataset | CocoDataset) -> tuple[PoseGroup, ...]:
     from kpbench.errors import DataError
-    from kpbench.exhibits import pose_table
-    from kpbench.pose import pose_errors
+    from kpbench.pose import pose_errors, pose_groups
     from kpbench.suite import board_in_view
 
     view = board_in_view(dataset.config)
     if view is None:
         raise DataError(f"{dataset.path}: shows no board that is known, --pose needs the dataset of a suite")
-    return pose_table(scores, pose_errors(scores.tally, *view))
+    return pose_groups(scores, pose_errors(scores.tally, *view))
 
 
 def _write_report(
