@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError
+from kpbench.errors import AugmentationError, DataError
 from kpbench.keypoints import UInt8
 from kpbench.scene import Placement
 
@@ -98,7 +98,7 @@ def augment(image: UInt8, placements: Sequence[Placement], pipeline: str, seed: 
 
     Raises
     ------
-    DataError
+    AugmentationError
         If a transform raises, gives an image of another shape or type, or mirrors a patch, which makes it another
         design.
     """
@@ -109,11 +109,13 @@ def augment(image: UInt8, placements: Sequence[Placement], pipeline: str, seed: 
     except Exception as error:  # whatever a transform raises
         said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         hint = "; some transforms work with --channels 3 only" if image.ndim == 2 else ""
-        raise DataError(f"--augment: {said}{hint}") from None
+        raise AugmentationError(f"--augment: {said}{hint}") from None
     result, came_from = np.ascontiguousarray(done["image"]), done["mask"]
     if result.shape != image.shape or result.dtype != np.uint8:
-        given, asked = (f"{a.dtype} of shape {a.shape}" for a in (result, image))
-        raise DataError(f"--augment: makes an image {given} out of {asked}; end the pipeline with Resize or a crop")
+        given, asked = (f"{'x'.join(map(str, a.shape[1::-1]))} {a.dtype}" for a in (result, image))
+        raise AugmentationError(
+            f"--augment: makes {given} of {asked}; end the pipeline with a resize or crop to that size"
+        )
     if np.array_equal(came_from, origin):
         return result, list(placements)
     moved = [_carried(placement, came_from) for placement in placements]
@@ -142,7 +144,7 @@ def _carried(placement: Placement, came_from: NDArray[np.float32]) -> Placement 
     if found is None:
         return None
     if np.linalg.det(found[:2, :2]) < 0:
-        raise DataError(
+        raise AugmentationError(
             "--augment: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
         )
     # where the move is no homography, the centre counts

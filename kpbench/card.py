@@ -38,13 +38,17 @@ def facts(dataset: Dataset) -> dict[str, str]:
     """Name and value of what holds for the whole dataset."""
     image, config, keypoints = dataset.image(0), dataset.config, dataset.truth.keypoints
     size = sum(shard.bytes for shard in dataset.shards)
-    backgrounds = config.get("backgrounds", {}).get("kind", "n/a")
+    made = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
+    made += [f"deterioration {config['deteriorate']}"] if "deteriorate" in config else []
+    made += [f"up to {config['distractors']} look-alikes an image"] if config.get("distractors") else []
+    made += ["an albumentations pipeline (in dataset.json)"] if config.get("augmentation") else []
+    designs = [f"{patch['name']} ({patch['id']})" for patch in config.get("patches", [])]
     return {
         "fingerprint": dataset.fingerprint,
         "images": f"{len(dataset)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}",
         "on disk": f"{size / 1e6:.1f} MB in {len(dataset.shards)} shards, {size / len(dataset) / 1e3:.1f} kB an image",
-        "made from": f"seed {config.get('seed')}, {backgrounds} backgrounds, "
-        f"deterioration {config.get('deteriorate', 'n/a')}",
+        "made from": ", ".join([f"seed {config.get('seed')}", *made]),
+        "designs": ", ".join(designs) or "n/a",
         "keypoints": f"{len(keypoints)}",
     }
 

@@ -120,7 +120,7 @@ def load_detector(name: str) -> LoadedDetector:
         made = found() if isinstance(found, type) else found
     except DataError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise DataError(f"detector {name!r}: cannot be made, {type(error).__name__}: {one_line(error)}") from None
     run = getattr(made, "detect", made)
     if not callable(run):

@@ -5,6 +5,7 @@
     KpbenchError            one line for the user: file, place, what was expected
     ├── DesignError         a patch, board or page that cannot be (TOML, geometry, paper size)
     ├── DataError           a dataset, shard, image folder or weights file that cannot be used
+    ├── AugmentationError   a pipeline of the user that cannot be applied to a scene
     ├── PredictionsError    a predictions file that cannot be read, or that fits no dataset
     └── GateFailed          the scores are fine to read, but a ``--min`` gate was not met
 
@@ -13,7 +14,7 @@ The command line prints the message and exits with 1; a library user catches ``K
 
 from __future__ import annotations
 
-__all__ = ["DataError", "DesignError", "GateFailed", "KpbenchError", "PredictionsError"]
+__all__ = ["AugmentationError", "DataError", "DesignError", "GateFailed", "KpbenchError", "PredictionsError"]
 
 
 class KpbenchError(Exception):
@@ -26,6 +27,10 @@ class DesignError(KpbenchError):
 
 class DataError(KpbenchError):
     """A dataset, shard, image folder or weights file that cannot be used."""
+
+
+class AugmentationError(KpbenchError):
+    """A pipeline of the user that cannot be applied to a scene."""
 
 
 class PredictionsError(KpbenchError):

@@ -148,7 +148,8 @@ def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         write_atomic(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
     listed = "".join(f"  {classes[i]}: {name}\n" for i, name in names.items())
-    text = f"path: .\ntrain: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listed}"
+    # without a path, folders are those beside this file
+    text = f"train: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listed}"
     write_atomic(folder / "data.yaml", text.encode())
     return folder / "data.yaml"
 

@@ -60,13 +60,20 @@ class Detections:
 
     def __post_init__(self) -> None:
         set_ = object.__setattr__
-        set_(self, "xy", np.asarray(self.xy, np.float64).reshape(-1, 2))
+        xy = np.asarray(self.xy, np.float64)
+        if xy.size and (xy.ndim != 2 or xy.shape[1] != 2):
+            raise ValueError(f"xy has shape {xy.shape}, expected (n, 2)")
+        set_(self, "xy", xy.reshape(-1, 2))
         set_(self, "score", np.asarray(self.score, np.float64).reshape(-1))
+        if len(self.score) != len(self.xy):
+            raise ValueError(f"{len(self.xy)} points have {len(self.score)} scores, expected as many")
         if self.patch_id is not None:
-            set_(self, "patch_id", np.asarray(self.patch_id, np.int64).reshape(-1))
-        ids = len(self.xy) if self.patch_id is None else len(self.patch_id)
-        if not len(self.xy) == len(self.score) == ids:
-            raise ValueError(f"{len(self.xy)} points, {len(self.score)} scores and {ids} ids do not belong together")
+            ids = np.asarray(self.patch_id)
+            if ids.size and not (np.isfinite(ids) & (ids == np.rint(ids))).all():
+                raise ValueError("patch_id holds numbers that are not whole")
+            set_(self, "patch_id", ids.astype(np.int64).reshape(-1))
+            if ids.size != len(self.xy):
+                raise ValueError(f"{len(self.xy)} points have {ids.size} patch IDs, expected as many")
 
     def __len__(self) -> int:
         return len(self.xy)

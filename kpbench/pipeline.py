@@ -130,7 +130,7 @@ def _predicted(
 def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> Found:
     try:
         found = detector(image)
-    except Exception as error:  # whatever a detector of somebody else raises
+    except (Exception, SystemExit) as error:  # whatever a detector of somebody else raises
         return Detections.none(), f"{type(error).__name__}: {one_line(error)}{_line_of(error)}"
     return _sure(found, threshold), ""
 
@@ -180,7 +180,7 @@ def degrade_files(
     Parameters
     ----------
     source : from :func:`kpbench.sources.open_images`; what cannot be decoded is named at the end.
-    out : folder; made if it is not there.
+    out : folder, made if it is not there; not the one that the images are in.
     steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
     seed : the n-th image written is a function of the n-th image, the steps, the seed and n.
 

@@ -8,7 +8,7 @@ from kpbench import match, refine
 from kpbench.augment import augment, load_augmentation
 from kpbench.cli import main
 from kpbench.design import shipped_patches
-from kpbench.errors import DataError
+from kpbench.errors import AugmentationError
 from kpbench.scene import Limits, random_placements, render_scene
 from kpbench.store import open_dataset
 
@@ -65,13 +65,13 @@ def test_what_moves_nothing_leaves_the_truth_as_it_is(tmp_path):
     ("name", "options", "said"),
     [
         ("HorizontalFlip", {}, "mirrors"),
-        ("Resize", {"height": 100, "width": 100}, "(100, 100)"),
+        ("Resize", {"height": 100, "width": 100}, "makes 100x100"),
         ("RandomCrop", {"height": 900, "width": 900}, "--augment: "),
     ],
 )
 def test_what_cannot_be_carried_is_refused(name, options, said, tmp_path):
     canonical = load_augmentation(saved(tmp_path, (name, options)))
-    with pytest.raises(DataError) as refused:
+    with pytest.raises(AugmentationError) as refused:
         augment(*scene(1), canonical, 0)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)

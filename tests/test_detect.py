@@ -1,7 +1,10 @@
+import re
+
 import numpy as np
 import pytest
 
-from kpbench.detect import load_detector, suppress, to_grey
+from kpbench import pipeline
+from kpbench.detect import LoadedDetector, load_detector, suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections
 
@@ -94,5 +97,29 @@ def test_to_grey_refuses_what_is_no_image():
 
 
 def test_detections_must_fit_together():
-    with pytest.raises(ValueError, match="do not belong together"):
+    with pytest.raises(ValueError, match="expected as many"):
         Detections([[1, 2]], [0.5, 0.6])
+
+
+@pytest.mark.parametrize(
+    ("xy", "score", "ids", "said"),
+    [
+        (np.zeros((2, 4)), np.ones(4), None, "shape (2, 4)"),
+        (np.zeros((2, 3)), np.ones(3), None, "shape (2, 3)"),
+        (np.zeros((3, 2)), np.ones(2), None, "3 points have 2 scores"),
+        (np.zeros((1, 2)), np.ones(1), [1.7], "not whole"),
+        (np.zeros((1, 2)), np.ones(1), [1, 2], "1 points have 2 patch IDs"),
+    ],
+)
+def test_detections_of_another_shape_are_refused(xy, score, ids, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        Detections(xy, score, ids)
+
+
+def test_a_detector_that_exits_fails_on_its_image():
+    def leave(image):
+        raise SystemExit(3)
+
+    found, said = pipeline._detect(LoadedDetector("leaver", "1", leave), np.zeros((8, 8), np.uint8), None)
+    assert len(found) == 0
+    assert "SystemExit" in said

@@ -138,7 +138,7 @@ def test_every_extended_condition_changes_the_image():
 
 
 def digests(folder):
-    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir())}
+    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 def test_interrupted_and_resumed_is_the_same(tmp_path):
@@ -272,6 +272,12 @@ def test_the_degrade_command(tmp_path):
     assert '[{"effect": "noise", "sigma": 20.0}, {"effect": "jpeg", "quality": 40.0}]' in one.stdout
     assert two.exit_code == 0
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
+    before = digests(source)
+    for path in (source, source / "grey.png"):
+        assert "would be overwritten" in run("degrade", path, "--effect", "blur", "--level", 7, "--out", source).stderr
+    assert digests(source) == before
+    (source / "dataset.json").write_text("{}")
+    assert "a dataset, expected images" in run("degrade", source, "--effect", "blur", "--level", 7).stderr
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ __all__ = ["bench"]
     multiple=True,
     default=["template", "superpoint-small"],
     show_default=True,
-    help="A shipped detector, MODULE:ATTR, or program:COMMAND; repeatable.",
+    help="A shipped detector, FILE.onnx, MODULE:ATTR, or program:COMMAND; repeatable.",
 )
 @click.option(
     "--out",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,7 +17,13 @@ __all__ = ["detect"]
 
 @click.command()
 @click.argument("source")
-@click.option("--detector", "name", default="template", show_default=True, help="By name, FILE.onnx, or MODULE:ATTR.")
+@click.option(
+    "--detector",
+    "name",
+    default="template",
+    show_default=True,
+    help="By name, FILE.onnx, MODULE:ATTR or program:COMMAND.",
+)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
 @click.option("--threshold", type=FINITE, help="Drop detections of a lower score.")
 @click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
@@ -45,6 +51,7 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
     from kpbench.cli.progress import progress_bar
+    from kpbench.detect import DETECTORS
     from kpbench.pipeline import predict, predict_images
     from kpbench.predictions import write_predictions
     from kpbench.sources import open_images
@@ -53,6 +60,8 @@ def detect(
     detector = _told(name, patches) if patches else name
     if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
         dataset = open_dataset(source)
+        if not patches and name in DETECTORS and _others(dataset.config):
+            click.echo(f"kpbench: {source} holds other designs than {name} looks for; tell it with --patches", err=True)
         with progress_bar(len(dataset), "detect") as progress:
             run = predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
     else:
@@ -66,6 +75,13 @@ def detect(
             click.echo(f"kpbench: {label}: {problem}", err=True)
         click.echo(f"kpbench: {len(run.failures)} images failed, they count as no detections", err=True)
         raise SystemExit(1)
+
+
+def _others(config: dict[str, Any]) -> bool:
+    """Whether a dataset's designs are others than those that ship."""
+    from kpbench.design import shipped_patches
+
+    return "patches" in config and config["patches"] != [patch.to_dict() for patch in shipped_patches()]
 
 
 def _told(name: str, patches: tuple[Path, ...]) -> LoadedDetector:

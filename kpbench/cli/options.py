@@ -39,6 +39,9 @@ class Names(click.ParamType[tuple[str, ...]]):
 class Finite(click.FloatRange):
     """A number within a range that is neither nan nor infinite, which click lets pass."""
 
+    def _describe_range(self) -> str:
+        return "" if self.min is self.max is None else super()._describe_range()
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         number = float(super().convert(value, param, ctx))
         if not math.isfinite(number):

@@ -93,12 +93,17 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     import json
 
     from kpbench.cli.progress import progress_bar
+    from kpbench.errors import DataError
     from kpbench.pipeline import degrade_files
     from kpbench.sources import open_images
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
     steps = tuple(zip(effects, levels, strict=True))
+    if (source / "dataset.json").exists():
+        raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
+    if (source if source.is_dir() else source.parent).resolve() == out.resolve():
+        raise DataError(f"{out}: holds the images themselves, which would be overwritten; name another --out")
     images = open_images(str(source))
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):

@@ -199,8 +199,14 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
         raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
 
 
-CANDIDATE = 0.08
+CANDIDATE = 0.1
 """Least score of the network from which a place is worth verifying."""
+SCALES = (1.0, 0.5, 1.5)
+"""Scales of the image at which candidates are looked for: small patches are found better enlarged, large ones shrunk.
+
+``scales=(1.0,)`` takes a third of the network's time and misses more of both."""
+SAME_PX = 3.0
+"""Candidates of two scales that are nearer to each other than this are one."""
 
 
 @dataclass
@@ -215,9 +221,12 @@ class SuperPointDetector:
         Least score of a detection, in [0, 1].
     verified : bool
         Whether the network's candidates are compared with the designs, which the file holds
-        (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides.
+        (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides, at
+        the image's own scale.
     threads : int
         Threads of ONNX Runtime; 0 leaves the choice to it.
+    scales : tuple of float
+        Scales of the image at which candidates are looked for, where they are verified.
 
     Raises
     ------
@@ -229,6 +238,7 @@ class SuperPointDetector:
     threshold: float = 0.5
     verified: bool = True
     threads: int = 0
+    scales: tuple[float, ...] = SCALES
     shipped: ClassVar[str] = "superpoint.onnx"
 
     def __post_init__(self) -> None:
@@ -264,7 +274,9 @@ class SuperPointDetector:
         greys = [to_grey(image) for image in images]
         if not greys or not greys[0].size:
             return [Detections.none() for _ in greys]
-        return [self._decoded(*parts) for parts in zip(greys, *self.heads(greys), strict=True)]
+        scales = self.scales if self.verified else (1.0,)
+        by_scale = [zip(*self.heads([_scaled(grey, scale) for grey in greys]), strict=True) for scale in scales]
+        return [self._decoded(grey, heads, scales) for grey, *heads in zip(greys, *by_scale, strict=True)]
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         """The two raw heads of several grey images of one size: (B, 65, h, w) and (B, ids + 1, h, w)."""
@@ -273,13 +285,21 @@ class SuperPointDetector:
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         return self._session.run(None, {"image": blob})
 
-    def _decoded(self, grey: UInt8, detector: Float32, ids: Float32) -> Detections:
+    def _decoded(self, grey: UInt8, heads: Sequence[tuple[Float32, Float32]], scales: Sequence[float]) -> Detections:
         how = Decoding(CANDIDATE if self.verified else self.threshold)
-        xy, score = locate(detector, how)
         height, width = grey.shape
-        inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
-        xy, score = xy[inside], score[inside]
-        log_id = identify(ids, xy)
+        places, scores, identities = list[Float](), list[Float](), list[Float]()
+        for (detector, ids), scale in zip(heads, scales, strict=True):
+            there, score = locate(detector, how)
+            xy = (there + 0.5) / scale - 0.5
+            inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
+            places.append(xy[inside])
+            scores.append(score[inside])
+            identities.append(identify(ids, there[inside]))
+        xy, score, log_id = np.concatenate(places), np.concatenate(scores), np.concatenate(identities)
+        if len(scales) > 1:
+            once = suppress(xy, score, SAME_PX)
+            xy, score, log_id = xy[once], score[once], log_id[once]
         if not self.verified or not len(xy) or min(grey.shape) < 2 * CELL:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify.examine(grey, xy, score, log_id, self.patches)
@@ -295,6 +315,15 @@ class SmallSuperPointDetector(SuperPointDetector):
     """The same with the smaller network."""
 
     shipped: ClassVar[str] = "superpoint-small.onnx"
+
+
+def _scaled(grey: UInt8, scale: float) -> UInt8:
+    """The image at another scale; the corner of its first pixel stays where it is."""
+    if scale == 1:
+        return grey
+    size = max(1, round(scale * grey.shape[1])), max(1, round(scale * grey.shape[0]))
+    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)
 
 
 def _first_line(error: Exception) -> str:
