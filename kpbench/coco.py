@@ -191,11 +191,11 @@ def _truth(content: Annotations, fingerprint: str) -> Truth:
         n = int(np.argmax(unknown))
         raise DataError(f"annotations[{n}]: image_id is {named[n]}, but there is no such image")
     image = sorter[place[labelled]]
-    order = np.argsort(image, kind="stable")
+    rows = np.flatnonzero(labelled)[np.argsort(image, kind="stable")]
     return Truth(
         image_id=ids,
         offsets=offsets_of(np.bincount(image, minlength=len(ids))),
-        keypoints=keypoints[labelled][order],
+        keypoints=keypoints if np.array_equal(rows, np.arange(len(keypoints))) else keypoints[rows],
         condition=np.array([image.condition for image in images], np.str_),
         rung=np.array([np.nan if image.rung is None else image.rung for image in images]),
         scene_id=np.array([image.id if image.scene_id is None else image.scene_id for image in images], np.int64),

@@ -165,7 +165,7 @@ def sections(report: Report) -> Iterator[Section]:
         )
     yield Section(
         "Precision and recall",
-        "Left: which detections to keep, from the surest only to all. Right: how near a detection must come.",
+        "Which detections to keep, from the surest only to all; and how near a detection must come.",
         (precision_recall_chart(runs), eps_chart(runs)),
     )
     sized = [g for g in runs[0].by if g.key.radius_px is not None]
