@@ -151,8 +151,7 @@ class OpenVinoSession:
     def __init__(self, model: bytes, threads: int) -> None:
         import openvino
 
-        settings = {"INFERENCE_NUM_THREADS": threads} if threads else {}
-        core = openvino.Core()
+        core, settings = openvino.Core(), {"INFERENCE_NUM_THREADS": threads}
         self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
@@ -168,7 +167,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
 
     The environment variable ``KPBENCH_RUNTIME`` chooses: "auto" (ONNX Runtime, on CUDA where the installed
-    package has it), "cpu", "cuda", or "openvino". 0 threads leaves their number to the runtime.
+    package has it), "cpu", "cuda", or "openvino". 0 threads means as many as OpenCV may use: one in worker processes.
 
     Raises
     ------
@@ -181,7 +180,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     if asked not in RUNTIMES:
         raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    options.intra_op_num_threads = threads or cv2.getNumThreads()
     options.log_severity_level = 3
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     if asked == "cuda" and not has_cuda:
@@ -194,7 +193,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     if asked != "openvino":
         return session, content
     try:
-        return OpenVinoSession(model, threads), content
+        return OpenVinoSession(model, threads or cv2.getNumThreads()), content
     except ModuleNotFoundError:
         raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
 
@@ -224,7 +223,7 @@ class SuperPointDetector:
         (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides, at
         the image's own scale.
     threads : int
-        Threads of ONNX Runtime; 0 leaves the choice to it.
+        Threads of the network's runtime; 0 means as many as OpenCV may use.
     scales : tuple of float
         Scales of the image at which candidates are looked for, where they are verified.
 
