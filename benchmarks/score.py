@@ -1,7 +1,7 @@
 """What the evaluator costs on synthetic tables: 5 true keypoints and 6 detections an image, 5 % missed, 15 % doubled.
 
     python benchmarks/score.py [IMAGES ...]           # growth; default 10000 100000 1000000
-    python benchmarks/score.py 100000 --files [json]  # and write and read every file format, or one
+    python benchmarks/score.py 100000 --files [json]  # instead: write and read every file format, or one
     python benchmarks/score.py 100000 --rivals        # instead: beside hotcoco and faster-coco-eval, where installed
 
 Times are CPU seconds after the imports. Every measurement runs in a process of its own, so that its peak memory is its
@@ -115,7 +115,7 @@ def write(path: Path, n: int) -> None:
     start = cpu_s()
     write_predictions(path, predictions)
     print(
-        f"{'':>8}   .{path.suffix[1:]:<8} {path.stat().st_size / 1e6:7.1f} MB, write {cpu_s() - start:6.2f} s",
+        f"{path.suffix:>16}: {path.stat().st_size / 1e6:7.1f} MB, write {cpu_s() - start:6.2f} s",
         end="",
         flush=True,
     )
@@ -183,6 +183,16 @@ def rival(name: str, folder: Path) -> None:
     )
 
 
+def compare(n: int, folder: Path) -> None:
+    print(f"{n} images")
+    alone(write_coco, folder, n)
+    for name in ("kpbench", "hotcoco", "faster-coco-eval"):
+        if importlib.util.find_spec(name.replace("-", "_")):
+            alone(rival, name, folder)
+        else:
+            print(f"{name:>16}: not installed")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("images", nargs="*", type=int, default=[10_000, 100_000, 1_000_000])
@@ -193,20 +203,16 @@ def main() -> None:
     args = parser.parse_args()
     for n in args.images:
         with tempfile.TemporaryDirectory() as folder:
-            if not args.rivals:
+            if args.rivals:
+                compare(n, Path(folder))
+            elif args.files is None:
                 alone(growth, n)
-                for suffix in () if args.files is None else args.files or FORMATS:
+            else:
+                print(f"{n} images")
+                for suffix in args.files or FORMATS:
                     path = Path(folder) / f"preds.{suffix}"
                     alone(write, path, n)
                     alone(read, path)
-                continue
-            print(f"{n} images")
-            alone(write_coco, Path(folder), n)
-            for name in ("kpbench", "hotcoco", "faster-coco-eval"):
-                if importlib.util.find_spec(name.replace("-", "_")):
-                    alone(rival, name, Path(folder))
-                else:
-                    print(f"{name:>16}: not installed")
 
 
 if __name__ == "__main__":
