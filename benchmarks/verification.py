@@ -18,6 +18,7 @@ import numpy as np
 import kpbench
 from kpbench import verify
 from kpbench.detectors.superpoint import CANDIDATE, SmallSuperPointDetector, SuperPointDetector
+from kpbench.workers import one_thread
 
 
 def main() -> None:
@@ -26,6 +27,7 @@ def main() -> None:
     parser.add_argument("--model")
     parser.add_argument("--images", type=int, help="only the first so many")
     options = parser.parse_args()
+    one_thread()
     dataset = kpbench.open_dataset(options.dataset)
     detector = SuperPointDetector(options.model) if options.model else SmallSuperPointDetector()
     plain = type(detector)(detector.path, CANDIDATE, verified=False)

@@ -201,15 +201,20 @@ def likeness(core: Float, whole: Float) -> Float:
     return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
 
 
+MOST_ROWS = 2**14
+"""Rows that are sampled at once: OpenCV's remap takes fewer than 2**15."""
+
+
 def _sample(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, points: Float) -> Float32:
     """Bilinear grey values (N, M) at ``xy + A @ points`` px of the image, each row from a level of its own."""
     values = np.empty((len(xy), len(points)), np.float32)
     fan = points.T.astype(np.float32)
     for n in np.unique(level):
-        rows = np.flatnonzero(level == n)
-        at, map_ = (xy[rows] * 0.5**n).astype(np.float32), (A[rows] * 0.5**n).astype(np.float32)
-        x, y = (map_[:, axis] @ fan + at[:, axis : axis + 1] for axis in (0, 1))
-        values[rows] = cv2.remap(levels[n], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        whole = np.flatnonzero(level == n)
+        for rows in np.split(whole, range(MOST_ROWS, len(whole), MOST_ROWS)):
+            at, map_ = (xy[rows] * 0.5**n).astype(np.float32), (A[rows] * 0.5**n).astype(np.float32)
+            x, y = (map_[:, axis] @ fan + at[:, axis : axis + 1] for axis in (0, 1))
+            values[rows] = cv2.remap(levels[n], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values
 
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench import degrade
+from kpbench import degrade, match
 from kpbench.background import procedural
 from kpbench.design import parse_patch, shipped_patches
 from kpbench.detect import load_detector
@@ -142,3 +142,10 @@ def test_edges_cross_where_the_centre_is(patch):
 def test_the_designs_are_not_written_into_the_code():
     code = Path(load_detector.__code__.co_filename).with_name("detectors") / "template.py"
     assert not any(patch.name in code.read_text() for patch in shipped_patches())
+
+
+def test_more_poses_than_remap_takes_at_once_are_sampled():
+    levels = match.pyramid(procedural(np.random.default_rng(0), 64, 48), 0)
+    xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
+    values = match._sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
+    assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()
