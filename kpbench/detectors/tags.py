@@ -94,4 +94,4 @@ class CharucoDetector:
         corners, ids, _, _ = self._detector.detectBoard(to_grey(image))
         if ids is None or not len(ids):
             return Detections.none()
-        return Detections(np.asarray(corners, np.float64), np.ones(len(ids)), np.asarray(ids, np.int64))
+        return Detections(np.asarray(corners, np.float64).reshape(-1, 2), np.ones(len(ids)), np.asarray(ids, np.int64))
