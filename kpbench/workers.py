@@ -96,9 +96,10 @@ def _in_processes(
     try:
         yield from _finished([pool.submit(_in_worker, work, piece) for piece in pieces], tell)
     finally:
-        pool.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
             process.terminate()
+        # waits for the pool's own thread, which else, after a worker's death, may be half closed when Python exits
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _finished(futures: Sequence[Future[Result]], tick: Callable[[], None]) -> Iterator[Result]:
