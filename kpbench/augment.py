@@ -9,7 +9,6 @@ carries the whole patch.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -20,7 +19,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.degrade import albumentations
 from kpbench.errors import AugmentationError, DataError
+from kpbench.files import read_text
+from kpbench.geometry import project
 from kpbench.keypoints import UInt8
 from kpbench.scene import Placement
 
@@ -40,20 +42,14 @@ def load_augmentation(path: str | Path) -> str:
     DataError
         If the file cannot be read, or holds no pipeline that the installed albumentations can build.
     """
-    file = Path(path)
+    text = read_text(path, DataError)
     try:
-        text = file.read_text("utf-8")
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read, {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DataError(f"{file}: cannot be read, not UTF-8 text") from None
-    try:
-        content = _yaml(text) if file.suffix.lower() in (".yaml", ".yml") else json.loads(text)
+        content = _yaml(text) if Path(path).suffix.lower() in (".yaml", ".yml") else json.loads(text)
         canonical = json.dumps(content, sort_keys=True)
         _pipeline(canonical)
     except Exception as error:  # whatever a parser or a transform's own checks raise
         said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise DataError(f"{file}: no pipeline as albumentations.save writes it ({said})") from None
+        raise DataError(f"{path}: no pipeline as albumentations.save writes it ({said})") from None
     return canonical
 
 
@@ -65,9 +61,7 @@ def _yaml(text: str) -> Any:
 
 @lru_cache(maxsize=4)
 def _pipeline(canonical: str) -> Any:
-    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"  # it looks on the network at import otherwise
-    import albumentations as A
-
+    A = albumentations()
     built = A.Compose([A.from_dict(json.loads(canonical))])
     _interpolate_masks(built)
     return built
@@ -140,17 +134,17 @@ def _carried(placement: Placement, came_from: NDArray[np.float32]) -> Placement 
         return None
     here, there = np.column_stack([columns, rows]).astype(np.float64), came_from[rows, columns, :2].astype(np.float64)
     middle = here.mean(axis=0)  # fitted from here, which is well conditioned
-    found = cv2.findHomography(there - H[:2, 2], here - middle, 0)[0]
-    if found is None:
+    fitted = cv2.findHomography(there - H[:2, 2], here - middle, 0)[0]
+    if fitted is None:
         return None
+    found = np.asarray(fitted, np.float64)
     if np.linalg.det(found[:2, :2]) < 0:
         raise AugmentationError(
             "--augment: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
         )
     # where the move is no homography, the centre counts
     inner = np.argsort((u * u + v * v)[rows, columns] / (w * w)[rows, columns])[:LEAST_PIXELS]
-    predicted = np.column_stack([there[inner] - H[:2, 2], np.ones(len(inner))]) @ found.T
-    left = (here[inner] - middle - predicted[:, :2] / predicted[:, 2:]).mean(axis=0)
+    left = (here[inner] - middle - project(found, there[inner] - H[:2, 2])).mean(axis=0)
     before, after = np.eye(3), np.eye(3)
     before[:2, 2], after[:2, 2] = -H[:2, 2], middle + left
     pose = after @ found @ before @ H

@@ -64,7 +64,7 @@ def _of_condition(scores: Scores, name: str, rungs: list[float], limit: float) -
     under = score < limit
     if np.isfinite(score).all() and (under.all() or not under.any()):
         yield Breakpoint(name, limit, "under" if under[0] else "over", None, None)
-    for crossing, rising in (("falls", False), ("rises", True)) if len(levels) > 1 else ():
+    for crossing, rising in (("falls", False), ("rises", True)):
         at = float(_first_crossing(levels, score, limit, rising))
         if np.isnan(at):
             continue
@@ -100,6 +100,8 @@ def _detection_scores(sums: NDArray[Any], rungs: int) -> Float:
 
 def _first_crossing(levels: Float, value: Float, limit: float, rising: bool) -> Float:
     """Where values of shape (…, R) first fall under (or rise to) a limit between two levels; nan where they do not."""
+    if len(levels) < 2:
+        return np.full(value.shape[:-1], np.nan)
     before, after = value[..., :-1], value[..., 1:]
     crosses = (before < limit) & (after >= limit) if rising else (before >= limit) & (after < limit)
     k = np.argmax(crosses, axis=-1)[..., None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from kpbench.keypoints import Float, UInt8
 from kpbench.preview import contact_sheet, draw_keypoints
 from kpbench.store import Dataset, write_atomic
 
-__all__ = ["FILES", "Histogram", "facts", "histograms", "overview", "write_card"]
+__all__ = ["FILES", "Histogram", "facts", "histograms", "names", "overview", "write_card"]
 
 FILES = ("README.md", "preview.png")
 """What :func:`write_card` writes."""
@@ -32,6 +32,12 @@ class Histogram:
     def shares(self) -> Float:
         """Of all that was counted, shape (n,)."""
         return self.counts / max(int(self.counts.sum()), 1)
+
+
+def names(dataset: Dataset) -> dict[int, str]:
+    """Name of every patch ID, from the dataset's config where it tells them."""
+    told = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
+    return {int(i): told.get(int(i), f"patch-{i}") for i in sorted({*told, *dataset.truth.keypoints["patch_id"]})}
 
 
 def facts(dataset: Dataset) -> dict[str, str]:
@@ -61,10 +67,13 @@ def histograms(dataset: Dataset) -> list[Histogram]:
     if not len(keypoints):
         return made
     major, minor = keypoints["radius_major"], keypoints["radius_minor"]
+    called = names(dataset)
+    by_id = _counted("patch ID", keypoints["patch_id"])
+    by_id = replace(by_id, labels=tuple(f"{label} ({called[int(label)]})" for label in by_id.labels))
     tilt_deg = np.degrees(np.arccos(np.clip(minor / major, 0, 1)))
     return [
         *made,
-        _counted("patch ID", keypoints["patch_id"]),
+        by_id,
         _binned("radius (major semi-axis), px", major, [0, 5, 8, 12, 20, 32, 50, 80, np.inf]),
         _binned("short axis (full length), px", 2 * minor, [0, 10, 16, 24, 40, 64, 100, 160, np.inf]),
         _binned("tilt by the axes, acos(minor / major), degrees", tilt_deg, [0, 15, 30, 45, 60, 75, 90]),
@@ -100,8 +109,7 @@ def write_card(dataset: Dataset, folder: Path) -> None:
     """
     sheet = cv2.cvtColor(overview(dataset, 12, 4, 320), cv2.COLOR_RGB2BGR)
     write_atomic(folder / FILES[1], cv2.imencode(".png", sheet)[1].tobytes())
-    names = {str(patch["id"]): patch["name"] for patch in dataset.config.get("patches", [])}
-    tables = "\n\n".join(_table(histogram, names) for histogram in histograms(dataset))
+    tables = "\n\n".join(map(_table, histograms(dataset)))
     said = "\n".join(f"| {key} | {value} |" for key, value in facts(dataset).items())
     versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())
     text = f"""---
@@ -135,10 +143,9 @@ Made with {versions}.
     write_atomic(folder / FILES[0], text.encode())
 
 
-def _table(histogram: Histogram, names: dict[str, str]) -> str:
-    by_id = histogram.title == "patch ID"
+def _table(histogram: Histogram) -> str:
     rows = [
-        f"| {f'{label} ({names[label]})' if by_id and label in names else label} | {count} | {share:.1%} |"
+        f"| {label} | {count} | {share:.1%} |"
         for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True)
     ]
     return "\n".join([f"| {histogram.title} | | |", "|---|---|---|", *rows])

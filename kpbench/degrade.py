@@ -25,6 +25,7 @@ from kpbench.raster import Box, box_around, coverage
 __all__ = [
     "LADDER",
     "Rungs",
+    "albumentations",
     "apply",
     "blur",
     "brightness",
@@ -127,19 +128,24 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
     return np.asarray(cv2.add(spread, np.zeros(1), dtype=cv2.CV_8U), np.uint8)
 
 
-@lru_cache(maxsize=8)
-def _albumentations(name: str) -> Any:
-    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"  # it looks on the network at import otherwise
-    import albumentations
+def albumentations() -> Any:
+    """The library, imported late: it is slow to import, and would look on the network for news of itself."""
+    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
+    import albumentations as library
 
+    return library
+
+
+@lru_cache(maxsize=8)
+def _transform(name: str) -> Any:
     # RandomShadow's own region of interest is the lower half of a road scene; here it is the image
     options = {"shadow_roi": (0, 0, 1, 1)} if name == "RandomShadow" else {}
-    return getattr(albumentations, name)(p=1.0, **options)
+    return getattr(albumentations(), name)(p=1.0, **options)
 
 
 def _drawn(name: str, image: UInt8, seed: int) -> tuple[Any, dict[str, Any]]:
     """A transform of the library, and what it draws for an image from a seed."""
-    transform = _albumentations(name)
+    transform = _transform(name)
     transform.set_random_seed(seed)
     return transform, transform.get_params_dependent_on_data({"shape": image.shape}, {})
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from kpbench.errors import DataError, KpbenchError
 
-__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_toml"]
+__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_text", "read_toml"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
@@ -30,13 +30,25 @@ def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
         One line that names the file, if it cannot be read or is no TOML.
     """
     try:
-        return tomllib.loads(Path(path).read_text("utf-8"))
+        return tomllib.loads(read_text(path, error))
+    except tomllib.TOMLDecodeError as problem:
+        raise error(f"{path}: not valid TOML ({problem})") from None
+
+
+def read_text(path: str | Path, error: type[KpbenchError]) -> str:
+    """The text of a UTF-8 file.
+
+    Raises
+    ------
+    error
+        One line that names the file, if it cannot be read.
+    """
+    try:
+        return Path(path).read_text("utf-8")
     except OSError as problem:
         raise error(f"{path}: cannot be read, {problem.strerror}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: cannot be read, not UTF-8 text") from None
-    except tomllib.TOMLDecodeError as problem:
-        raise error(f"{path}: not valid TOML ({problem})") from None
 
 
 def folder_at(where: str | Path) -> Path:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.card import write_card
+from kpbench.card import names, write_card
 from kpbench.errors import DataError
 from kpbench.keypoints import KEYPOINT_DTYPE, UInt8
 from kpbench.store import Dataset, write_atomic
@@ -66,12 +66,6 @@ def _png(image: UInt8) -> bytes:
     return bytes(cv2.imencode(".png", pixels)[1])
 
 
-def _names(dataset: Dataset) -> dict[int, str]:
-    """Name of every patch ID, from the dataset's config where it tells them."""
-    names = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
-    return {int(i): names.get(int(i), f"patch-{i}") for i in sorted({*names, *dataset.truth.keypoints["patch_id"]})}
-
-
 def _boxes(keypoints: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
     """Boxes around the projected discs, cut at the image, px from the corner: (n, 4) of x, y, w, h."""
     H = keypoints["H_patch2image"]
@@ -114,7 +108,7 @@ def _coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         progress(1)
     categories = [
         {"id": i + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
-        for i, name in _names(dataset).items()
+        for i, name in names(dataset).items()
     ]
     info = {"description": "kpbench dataset", "fingerprint": dataset.fingerprint}  # checked when scoring
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
@@ -134,8 +128,8 @@ def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     for name in ("images", "labels"):
         (folder / name).mkdir()
     ids = dataset.truth.image_id
-    names = _names(dataset)
-    classes = {patch_id: n for n, patch_id in enumerate(names)}
+    called = names(dataset)
+    classes = {patch_id: n for n, patch_id in enumerate(called)}
     for n in range(len(dataset)):
         image, keypoints = dataset[n]
         height, width = image.shape[:2]
@@ -147,7 +141,7 @@ def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         write_atomic(folder / "images" / f"{ids[n]:08d}.png", _png(image))
         write_atomic(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
-    listed = "".join(f"  {classes[i]}: {name}\n" for i, name in names.items())
+    listed = "".join(f"  {classes[i]}: {name}\n" for i, name in called.items())
     # without a path, folders are those beside this file
     text = f"train: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listed}"
     write_atomic(folder / "data.yaml", text.encode())

@@ -44,6 +44,7 @@ COLUMNS = (
     "degradations",
     "background",
 )
+MOST_OPEN = 128  # shards that are open at a time; a process may often have no more than 256 files
 MOST_DEFLATE = 1100  # deflate cannot shrink more than 1032-fold; what declares more is no honest file
 
 
@@ -351,9 +352,11 @@ class Dataset:
         if self._process != os.getpid():
             self._files, self._process = {}, os.getpid()
         name = self.shards[n].file
-        if name not in self._files:
-            self._files[name] = open_shard(self.path / name)
-        return self._files[name]
+        file = self._files.pop(name, None) or open_shard(self.path / name)
+        if len(self._files) == MOST_OPEN:
+            self._files.pop(next(iter(self._files))).close()
+        self._files[name] = file  # last, as the one used last
+        return file
 
     def _locate(self, index: int) -> tuple[Any, int, Path]:
         if not 0 <= index < len(self):
@@ -384,30 +387,21 @@ class Dataset:
         """(image, keypoints), so that a torch DataLoader can take the dataset as it is."""
         return self.image(index), self.keypoints(index)
 
-    def _parts(self, name: str) -> list[NDArray[Any]]:
-        parts = []
+    def _parts(self, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+        """Whole columns of one shard after the other."""
         for n, shard in enumerate(self.shards):
             with _reading(self.path / shard.file):
-                data = self._shard(n)[name]
-                parts.append(data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:])
-        return parts
-
-    def _column(self, name: str) -> NDArray[Any]:
-        return np.concatenate(self._parts(name))
+                found = [self._shard(n)[name] for name in names]
+                yield [data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:] for data in found]
 
     @cached_property
     def truth(self) -> Truth:
         """All true keypoints as one table."""
-        counts = np.concatenate([np.diff(offsets) for offsets in self._parts("offsets")])
-        return Truth(
-            image_id=self._column("image_id"),
-            offsets=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-            keypoints=self._column("keypoints"),
-            condition=self._column("condition"),
-            rung=self._column("rung"),
-            scene_id=self._column("scene_id"),
-            fingerprint=self.fingerprint,
-        )
+        names = ("image_id", "keypoints", "condition", "rung", "scene_id")
+        offsets, *columns = zip(*self._parts(("offsets", *names)), strict=True)
+        counts = np.concatenate([np.diff(part) for part in offsets])
+        whole = dict(zip(names, map(np.concatenate, columns), strict=True))
+        return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]), fingerprint=self.fingerprint)
 
     def verify(self) -> Iterator[ShardEntry]:
         """Check every shard against the manifest, yielding each one that is whole.

@@ -100,7 +100,7 @@ def test_the_paper_mix_records_what_it_did():
 def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch):
     import os
 
-    degrade._albumentations.cache_clear()
+    degrade._transform.cache_clear()
     monkeypatch.delenv("NO_ALBUMENTATIONS_UPDATE", raising=False)
     shadow(picture(), 1)
     assert os.environ["NO_ALBUMENTATIONS_UPDATE"] == "1"

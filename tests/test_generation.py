@@ -7,8 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
 from kpbench import store
+from kpbench.cli import main
 from kpbench.errors import DataError
 from kpbench.generation import generate, generate_part, merge
 from kpbench.synth import SynthConfig
@@ -229,6 +231,8 @@ def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
     there = store.open_dataset(Path(url))  # as the command line has it
     assert (there.image(7) == local.image(7)).all()
     assert len(list(there.verify())) == 3
+    for command in ("inspect", "preview", "verify"):
+        assert CliRunner().invoke(main, [command, url]).exit_code == 0
     with pytest.raises(DataError, match="already holds a dataset"):
         generate(config(photos), url, workers=1)
     with pytest.raises(DataError, match=r"nosuch:.* cannot be reached"):

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from kpbench import store
 from kpbench.errors import DataError
 from kpbench.keypoints import KEYPOINT_DTYPE
 from kpbench.store import (
@@ -217,3 +218,13 @@ def test_a_damaged_folder_is_one_line(tmp_path, damage, says):
 def test_a_missing_folder_says_how_to_make_one(tmp_path):
     with pytest.raises(DataError, match="no dataset there"):
         open_dataset(tmp_path / "nowhere")
+
+
+def test_many_shards_need_few_open_files(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "MOST_OPEN", 2)
+    data = open_dataset(write_dataset(tmp_path / "set", counts=(2, 2, 2, 2, 2)))
+    assert data.truth.image_id.tolist() == list(range(10))
+    expected = [sample for first in range(0, 10, 2) for sample in samples(2, first)]
+    for n in (9, 0, 5, 1, 8):
+        assert (data.image(n) == expected[n].image).all()
+        assert len(data._files) <= 2

@@ -51,7 +51,6 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.detect import DETECTORS
     from kpbench.pipeline import predict, predict_images
     from kpbench.predictions import write_predictions
     from kpbench.sources import open_images
@@ -60,8 +59,12 @@ def detect(
     detector = _told(name, patches) if patches else name
     if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
         dataset = open_dataset(source)
-        if not patches and name in DETECTORS and _others(dataset.config):
-            click.echo(f"kpbench: {source} holds other designs than {name} looks for; tell it with --patches", err=True)
+        if not patches and name in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
+            click.echo(
+                f"kpbench: {source} holds other designs than {name} looks for; use template with --patches, "
+                "or weights trained on them",
+                err=True,
+            )
         with progress_bar(len(dataset), "detect") as progress:
             run = predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
     else:

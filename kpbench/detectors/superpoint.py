@@ -273,8 +273,10 @@ class SuperPointDetector:
         greys = [to_grey(image) for image in images]
         if not greys or not greys[0].size:
             return [Detections.none() for _ in greys]
-        scales = self.scales if self.verified else (1.0,)
-        by_scale = [zip(*self.heads([_scaled(grey, scale) for grey in greys]), strict=True) for scale in scales]
+        views = [[_scaled(grey, scale) for grey in greys] for scale in (self.scales if self.verified else (1.0,))]
+        # what rounding to whole pixels makes of the scales in x and y
+        scales = [np.divide(view[0].shape, greys[0].shape)[::-1] for view in views]
+        by_scale = [zip(*self.heads(view), strict=True) for view in views]
         return [self._decoded(grey, heads, scales) for grey, *heads in zip(greys, *by_scale, strict=True)]
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
@@ -284,7 +286,7 @@ class SuperPointDetector:
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         return self._session.run(None, {"image": blob})
 
-    def _decoded(self, grey: UInt8, heads: Sequence[tuple[Float32, Float32]], scales: Sequence[float]) -> Detections:
+    def _decoded(self, grey: UInt8, heads: Sequence[tuple[Float32, Float32]], scales: Sequence[Float]) -> Detections:
         how = Decoding(CANDIDATE if self.verified else self.threshold)
         height, width = grey.shape
         places, scores, identities = list[Float](), list[Float](), list[Float]()
@@ -296,9 +298,8 @@ class SuperPointDetector:
             scores.append(score[inside])
             identities.append(identify(ids, there[inside]))
         xy, score, log_id = np.concatenate(places), np.concatenate(scores), np.concatenate(identities)
-        if len(scales) > 1:
-            once = suppress(xy, score, SAME_PX)
-            xy, score, log_id = xy[once], score[once], log_id[once]
+        once = suppress(xy, score, SAME_PX)
+        xy, score, log_id = xy[once], score[once], log_id[once]
         if not self.verified or not len(xy) or min(grey.shape) < 2 * CELL:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify.examine(grey, xy, score, log_id, self.patches)
