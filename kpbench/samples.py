@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from kpbench import degrade
 from kpbench.background import PhotoFolder, procedural
 from kpbench.design import Patch
+from kpbench.detectors.superpoint import resize
 from kpbench.geometry import projected_discs
 from kpbench.keypoints import Float, UInt8
 from kpbench.lookalikes import draw_lookalikes
@@ -40,6 +41,10 @@ MOST_KEYPOINTS = 12
 VALIDATION_EVERY = 10
 IMAGE_PX = (640, 480)  # the image that a crop is thought to be cut from: focal lengths are relative to it
 ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
+VIEWS = {1.0: 0.5, 1.5: 0.35, 0.5: 0.15}
+"""Scales at which a crop's image is shown, as the detector looks at all of them, and how often each comes."""
+VIEW_RADIUS_PX = (5.0, 40.0)
+"""Radii at the scale 1.5, where what is large is left to the other scales; px of the image itself."""
 DETECTABLE = 15.0
 """Least contrast / noise · √area of a keypoint that is asked for: 7.5 sigma at the output of a matched filter."""
 FAINTEST = 4.0
@@ -252,11 +257,12 @@ def _crops(
     keypoints = _no_keypoints(count)
     discs: list[list[Disc]] = []
     canvases: list[UInt8] = []
-    for _ in range(count):
-        image = _background(photos, rng, width, height)
+    scales = rng.choice(list(VIEWS), count, p=list(VIEWS.values()))
+    for scale in scales:
+        image = _background(photos, rng, round(width / scale), round(height / scale))
         if rng.random() < 0.5:
             draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
-        drawn = _lay_out(rng, patches, image)
+        drawn = _lay_out(rng, patches, image, Limits(radius_px=VIEW_RADIUS_PX) if scale > 1 else Limits())
         discs.append(drawn)
         canvases.append(image)
     _paint_all(canvases, discs)
@@ -264,16 +270,18 @@ def _crops(
         hidden = _occlude(canvases[n], rng, discs[n], patches) if rng.random() < 0.08 * severity else ()
         radius = min((d.minor for d in discs[n]), default=20.0)
         image, gain, kernel, sigma = _degrade(canvases[n], rng, severity, radius)
-        images[n] = image
-        inside = [d for d in discs[n] if -0.5 <= d.x < width - 0.5 and -0.5 <= d.y < height - 0.5]
-        for k, disc in enumerate(inside[:MOST_KEYPOINTS]):
+        images[n] = resize(image, width, height)
+        scale = np.divide(images[n].shape, image.shape)[::-1]
+        at = [((d.x + 0.5) * scale[0] - 0.5, (d.y + 0.5) * scale[1] - 0.5) for d in discs[n]]
+        inside = [(x, y, d) for (x, y), d in zip(at, discs[n], strict=True) if _holds(images[n], x, y)]
+        for k, (x, y, disc) in enumerate(inside[:MOST_KEYPOINTS]):
             kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
             contrast = gain * (disc.placement.white - disc.placement.black) * max(kept, 0.0)
             area = np.pi * disc.major * disc.minor
             buried = contrast < max(FAINTEST, DETECTABLE * sigma / np.sqrt(area))
-            small = disc.minor < 0.5 * Limits().minor_axis_px
+            small = disc.minor * scale.min() < 0.5 * Limits().minor_axis_px
             lost = buried or small or any(disc is h for h in hidden)
-            keypoints[n, k] = disc.x, disc.y, disc.place, disc.major if lost else 0.0
+            keypoints[n, k] = x, y, disc.place, disc.major * scale.max() if lost else 0.0
     return Batch(images, keypoints)
 
 
@@ -307,12 +315,15 @@ def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, h
     return image
 
 
-def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8) -> list[Disc]:
+def _holds(image: UInt8, x: float, y: float) -> bool:
+    return bool(-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5)
+
+
+def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, limits: Limits) -> list[Disc]:
     """Choose the patches of one crop; draw the paper below them into the image, if there is any."""
     height, width = image.shape
-    limits = Limits()
     on_board = rng.random() < 0.5
-    asked = int(rng.choice(5, p=(0.3, 0.32, 0.16, 0.13, 0.09)))
+    asked = int(rng.choice(5, p=(0.15, 0.3, 0.22, 0.18, 0.15)))
     if asked == 0:
         if on_board:
             _paper(image, rng, _poses(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])

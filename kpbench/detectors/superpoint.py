@@ -34,6 +34,7 @@ __all__ = [
     "locate",
     "open_session",
     "pad_to_cells",
+    "resize",
 ]
 
 CELL = 8
@@ -135,6 +136,14 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     """Repeat the last row and column until both sides are multiples of 8; (0, 0) stays where it is."""
     height, width = grey.shape
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
+
+
+def resize(grey: UInt8, width: int, height: int) -> UInt8:
+    """The image in another size; the outer corners of its corner pixels stay where they are."""
+    if grey.shape == (height, width):
+        return grey
+    how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=how), np.uint8)
 
 
 class Session(Protocol):
@@ -271,9 +280,13 @@ class SuperPointDetector:
             If one is no image, or they differ in size.
         """
         greys = [to_grey(image) for image in images]
+        if len({grey.shape for grey in greys}) > 1:
+            raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         if not greys or not greys[0].size:
             return [Detections.none() for _ in greys]
-        views = [[_scaled(grey, scale) for grey in greys] for scale in (self.scales if self.verified else (1.0,))]
+        height, width = greys[0].shape
+        sizes = [(round(scale * width), round(scale * height)) for scale in (self.scales if self.verified else (1.0,))]
+        views = [[resize(grey, max(1, w), max(1, h)) for grey in greys] for w, h in sizes]
         # what rounding to whole pixels makes of the scales in x and y
         scales = [np.divide(view[0].shape, greys[0].shape)[::-1] for view in views]
         by_scale = [zip(*self.heads(view), strict=True) for view in views]
@@ -281,8 +294,6 @@ class SuperPointDetector:
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         """The two raw heads of several grey images of one size: (B, 65, h, w) and (B, ids + 1, h, w)."""
-        if len({grey.shape for grey in greys}) > 1:
-            raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         return self._session.run(None, {"image": blob})
 
@@ -315,15 +326,6 @@ class SmallSuperPointDetector(SuperPointDetector):
     """The same with the smaller network."""
 
     shipped: ClassVar[str] = "superpoint-small.onnx"
-
-
-def _scaled(grey: UInt8, scale: float) -> UInt8:
-    """The image at another scale; the corner of its first pixel stays where it is."""
-    if scale == 1:
-        return grey
-    size = max(1, round(scale * grey.shape[1])), max(1, round(scale * grey.shape[0]))
-    how = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
-    return np.asarray(cv2.resize(grey, size, interpolation=how), np.uint8)
 
 
 def _first_line(error: Exception) -> str:
