@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import cProfile
+import multiprocessing
 import os
 import pstats
 import subprocess
@@ -24,6 +25,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +169,25 @@ def scaling(photos: PhotoFolder, n: int, rounds: int, channels: int) -> None:
                 print(f"n {images}, workers {workers}: {took:.1f} s, peak {own:.0f} / {child:.0f} MB")
     ratio = np.median(np.array(spent[n, 1]) / np.array(spent[n, 2]))
     print(f"one worker / two workers {ratio:.2f}")
+    print(f"what two processes of the floor alone gain on this machine {ceiling(photos, n, rounds, channels):.2f}")
+
+
+def ceiling(photos: PhotoFolder, n: int, rounds: int, channels: int) -> float:
+    """The same ratio for two processes that share nothing: two threads of one core are less than two cores."""
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
+
+        def both(count: int) -> float:
+            start = time.perf_counter()
+            list(pool.map(timed, *zip(*[(floor, photos, count // 2, seed, channels) for seed in (0, 1)], strict=True)))
+            return time.perf_counter() - start
+
+        both(40)  # imports, caches
+        ratios = []
+        for seed in range(rounds):
+            start = time.perf_counter()
+            pool.submit(timed, floor, photos, n, seed, channels).result()
+            ratios.append((time.perf_counter() - start) / both(n))
+    return float(np.median(ratios))
 
 
 if __name__ == "__main__":
