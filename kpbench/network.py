@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from kpbench.errors import DataError
 from kpbench.recipe import Loss, NetworkConfig
 
-__all__ = ["CELL", "SuperPoint", "Targets", "initialise", "losses", "make_targets", "read_weights"]
+__all__ = ["CELL", "SuperPoint", "Targets", "initialise", "losses", "make_targets", "read_weights", "unfold"]
 
 CELL = 8
 """Side of a cell, px: three stages of the encoder halve the image."""
@@ -148,11 +148,13 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
     ------
     DataError
         If a tensor has no place in the network or another shape, or a part of the network but the
-        attached layers gets none.
+        attached layers gets none. Weights without any BatchNorm are complete, see :func:`unfold`.
     """
     own = network.state_dict()
+    folded = not any(".bn." in name for name in weights)
     # the count of batches seen is no weight, and some files lack it
-    wanted = {name for name in own if "_attached" not in name and not name.endswith("num_batches_tracked")}
+    ours = {name for name in own if not (name.endswith("num_batches_tracked") or (folded and ".bn." in name))}
+    wanted = {name for name in ours if "_attached" not in name}
     given = {name for name in weights if not name.endswith("num_batches_tracked")}
     for name in sorted(given - set(own)):
         raise DataError(f"{source}: {name} has no place in this network")
@@ -160,11 +162,34 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
         raise DataError(f"{source}: {name} is missing")
     for name in sorted(given):
         if own[name].shape != weights[name].shape:
-            theirs, ours = tuple(weights[name].shape), tuple(own[name].shape)
-            raise DataError(f"{source}: {name} has shape {theirs}, expected {ours}")
+            theirs, expected = tuple(weights[name].shape), tuple(own[name].shape)
+            raise DataError(f"{source}: {name} has shape {theirs}, expected {expected}")
     network.load_state_dict({name: weights[name] for name in given}, strict=False)
-    fresh = sorted({name.split(".")[0] for name in own if name not in given and "num_batches" not in name})
+    fresh = sorted({name.split(".")[0] for name in ours - given})
     return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
+
+
+def unfold(network: SuperPoint, images: Tensor) -> None:
+    """Let each BatchNorm pass on what it gets, as its statistics stand on these images (B, 1, H, W) in [0, 1].
+
+    The contrary of folding: the network computes what its convolutions alone would, and can be trained on.
+    """
+
+    def pass_on(module: nn.Module, given: tuple[Tensor]) -> None:
+        bn = cast(nn.BatchNorm2d, module)
+        variance, mean = torch.var_mean(given[0], (0, 2, 3), correction=0)
+        cast(Tensor, bn.running_mean).copy_(mean)
+        cast(Tensor, bn.running_var).copy_(variance)
+        bn.weight.copy_((variance + bn.eps).sqrt())
+        bn.bias.copy_(mean)
+
+    hooks = [m.register_forward_pre_hook(pass_on) for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
+    mode = network.training
+    with torch.no_grad():
+        network.eval()(images)
+    network.train(mode)
+    for hook in hooks:
+        hook.remove()
 
 
 # Losses -----------------------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
-from kpbench.network import SuperPoint, initialise, losses, make_targets, read_weights
+from kpbench.network import SuperPoint, initialise, losses, make_targets, read_weights, unfold
 from kpbench.recipe import Recipe, parse_recipe
 from kpbench.samples import Batch, Job, load_photos, make_batch, stream
 from kpbench.store import write_atomic
@@ -128,11 +128,32 @@ def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Sup
     return network.eval()
 
 
-def initial_weights(path: str | Path) -> dict[str, Tensor]:
-    """A state-dict to start from: published SuperPoint weights, or the running mean of a checkpoint."""
-    weights = read_weights(path)
-    mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
-    return mean or weights
+def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Tensor]:
+    """A state-dict to start from.
+
+    Published SuperPoint weights, the running mean of a checkpoint, or an ONNX file of ``kpbench export-model``,
+    ``superpoint-small`` being the one that ships. An ID head for other designs is left out.
+    """
+    path = _shipped(path)
+    if path.suffix != ".onnx":
+        weights = read_weights(path)
+        mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
+        return mean or weights
+    import onnx
+
+    try:
+        model = onnx.load(path)
+        content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
+    except Exception as error:  # protobuf's own, which is not public, among others
+        raise DataError(f"{path}: cannot be read as an ONNX model ({str(error).splitlines()[0][:200]})") from None
+    weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
+    same = content.get("designs") == designs_digest(patches)
+    return {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
+
+
+def _shipped(path: str | Path) -> Path:
+    ours = Path(__file__).parent / "weights" / f"{path}.onnx"
+    return ours if ours.is_file() and not Path(path).exists() else Path(path)
 
 
 def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
@@ -171,6 +192,11 @@ def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
 # The loop ----------------------------------------------------------------------------------------------
 
 
+def _blob(images: Tensor) -> Tensor:
+    """Images (B, H, W) uint8 as the network takes them."""
+    return (images.float() / 255)[:, None].contiguous(memory_format=torch.channels_last)
+
+
 def step_once(state: State, forward: nn.Module, images: Tensor, keypoints: Tensor, world: int) -> tuple[Tensor, Tensor]:
     """One step of the optimizer; (detector loss, identity loss)."""
     recipe, network = state.recipe, state.network
@@ -184,7 +210,7 @@ def step_once(state: State, forward: nn.Module, images: Tensor, keypoints: Tenso
 
     height, width = images.shape[-2:]
     device = images.device
-    blob = (images.float() / 255)[:, None].contiguous(memory_format=torch.channels_last)
+    blob = _blob(images)
     with torch.autocast(device.type, torch.bfloat16, enabled=recipe.precision == "bf16"):
         detector, ids = forward(blob)
     targets = make_targets(keypoints, height, width, recipe.network.ids, recipe.loss.place)
@@ -259,7 +285,7 @@ def train(
     backgrounds : path, optional
         Folder of photographs; every tenth is kept for validation. None: procedural textures.
     init : path, optional
-        Published SuperPoint weights (:func:`kpbench.network.initialise`) or another checkpoint to start from.
+        What to start from, see :func:`initial_weights`.
     resume_run : bool
         Go on from the checkpoint in ``out``.
     minutes : float, optional
@@ -309,7 +335,12 @@ def train(
     if resume_run:
         resume(state, checkpoint, designs)
     elif init is not None:
-        say(initialise(state.network, initial_weights(init), str(init)))
+        weights = initial_weights(init, designs)
+        say(initialise(state.network, weights, str(init)))
+        if not any(".bn." in name for name in weights):
+            photos = load_photos(backgrounds, "training")
+            batch = make_batch(recipe.samples, designs, photos, recipe.seed, 0, 128, recipe.phase(0)[1])
+            unfold(state.network, _blob(torch.from_numpy(batch.images).to(device)))
         state.mean.load_state_dict(state.network.state_dict())
     held_out = load_photos(backgrounds, "validation") if rank == 0 else []
     validation = validation_set(recipe, designs, held_out, validation_images) if rank == 0 else None

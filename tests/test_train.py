@@ -14,6 +14,7 @@ from safetensors.torch import load_file
 
 from kpbench import train as training
 from kpbench.design import shipped_patches
+from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.errors import DataError
 from kpbench.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
 from kpbench.samples import Batch, SampleConfig
@@ -69,6 +70,27 @@ def test_interrupted_and_resumed_equals_undisturbed_to_the_bit(tmp_path, run, st
     assert not same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
     assert run(recipe, tmp_path / "parts", resume_run=True)
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
+
+
+def test_shipped_weights_are_trained_on_from_what_they_find(tmp_path, run):
+    recipe = replace(load_recipe(CONFIGS / "reference.toml"), batch=4, lr=1e-12)
+    recipe = replace(recipe, phases=(Phase(4, "attached"),))  # one step that leaves everything as it is
+    said = []
+    assert run(recipe, tmp_path, init="superpoint-small", say=said.append)
+    assert said == ["superpoint-small: 30 tensors matched; not in it: nothing"]
+    content, tensors = training.read_checkpoint(tmp_path / "checkpoint.safetensors")
+    detector = SmallSuperPointDetector()
+    images = np.random.default_rng(0).integers(0, 256, (2, 64, 72), np.uint8)
+    with torch.inference_mode():
+        ours = training.network_of(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
+    for mine, theirs in zip(ours, detector.heads(list(images)), strict=True):
+        assert np.abs(mine.numpy() - theirs).max() < 1e-3
+
+
+def test_other_designs_leave_out_the_id_head_of_an_exported_file():
+    assert "descriptor_attached.weight" not in training.initial_weights("superpoint-small", shipped_patches()[::-1])
+    with pytest.raises(DataError, match="cannot be read as an ONNX model"):
+        training.initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
 
 
 def test_worker_processes_change_nothing(tmp_path, run):

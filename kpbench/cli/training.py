@@ -18,7 +18,12 @@ INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
 @click.option("--out", type=click.Path(path_type=Path), help="Folder of the run; default: runs/NAME of the recipe.")
 @click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
 @PATCHES
-@click.option("--init", type=click.Path(path_type=Path), help="SuperPoint weights to start from (.pth, .safetensors).")
+@click.option(
+    "--init",
+    type=click.Path(path_type=Path),
+    help="Weights to start from: superpoint-small (the shipped ones), an exported .onnx, a checkpoint, or SuperPoint's "
+    "(.pth, .safetensors).",
+)
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder.")
 @click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes making samples.")
