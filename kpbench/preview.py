@@ -47,18 +47,20 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
 
 
 def draw_detections(image: UInt8, detections: Detections) -> UInt8:
-    """An RGB copy of an image with a cross, a ring and the ID on every detection."""
+    """An RGB copy of an image with a cross, a ring and the ID on every detection, larger in larger images."""
     canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image.copy(), np.uint8)
+    unit = max(1, round(max(canvas.shape) / 800))
     for n, (x, y) in enumerate(detections.xy):
         patch_id = None if detections.patch_id is None else int(detections.patch_id[n])
-        colour = (255, 0, 0) if patch_id is None else COLOURS[patch_id % len(COLOURS)]
-        at = (round(x * 16), round(y * 16))
-        cv2.circle(canvas, at, 9 * 16, colour, 1, cv2.LINE_AA, 4)
-        for dx, dy in ((4, 0), (0, 4)):
-            cv2.line(canvas, (round(x - dx), round(y - dy)), (round(x + dx), round(y + dy)), colour, 1)
-        if patch_id is not None:
-            text_at = (round(x + 10), round(y - 4))
-            cv2.putText(canvas, str(patch_id), text_at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+        own = (255, 0, 0) if patch_id is None else COLOURS[patch_id % len(COLOURS)]
+        for colour, width in (((0, 0, 0), 3 * unit), (own, unit)):  # a dark seam, to be seen on any ground
+            at = (round(x * 16), round(y * 16))
+            cv2.circle(canvas, at, 9 * 16 * unit, colour, width, cv2.LINE_AA, 4)
+            for dx, dy in ((4 * unit, 0), (0, 4 * unit)):
+                cv2.line(canvas, (round(x - dx), round(y - dy)), (round(x + dx), round(y + dy)), colour, width)
+            if patch_id is not None:
+                text_at, font = (round(x + 11 * unit), round(y - 4 * unit)), cv2.FONT_HERSHEY_SIMPLEX
+                cv2.putText(canvas, str(patch_id), text_at, font, 0.55 * unit, colour, width, cv2.LINE_AA)
     return canvas
 
 
