@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -151,7 +153,9 @@ def open_coco(path: str | Path) -> CocoDataset:
         with without_gc():
             content = _annotations(data)
             truth = _truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
-            return CocoDataset(path, truth, tuple(image.file_name for image in content.images))
+            files = tuple(image.file_name for image in content.images)
+            del content  # else the collector would walk through it
+        return CocoDataset(path, truth, files)
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {error.strerror}") from None
     except (DataError, PredictionsError) as error:
@@ -183,7 +187,7 @@ def _truth(content: Annotations, fingerprint: str) -> Truth:
     sorter = np.argsort(ids, kind="stable")
     if np.any(np.diff(ids[sorter]) == 0):
         raise DataError("two images share an id")
-    named = np.array([entry.image_id for entry in annotations], np.int64)
+    named = _column(annotations, "image_id", np.int64)
     keypoints, labelled = _keypoints(annotations)
     place = np.searchsorted(ids, named, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != named
@@ -206,22 +210,20 @@ def _truth(content: Annotations, fingerprint: str) -> Truth:
 def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """The table of all annotations, and which of them are labelled."""
     table = np.zeros(len(annotations), KEYPOINT_DTYPE)
-    points = np.fromiter(chain.from_iterable([a.keypoints for a in annotations]), np.float64).reshape(-1, 3)
+    points = _points(annotations)
     table["x"], table["y"] = points[:, 0], points[:, 1]
-    table["patch_id"] = [a.category_id - 1 for a in annotations]
-    major = [a.radius if a.radius_major is None else a.radius_major for a in annotations]
-    if None in major:
-        raise DataError(
-            f"annotations[{major.index(None)}] (image_id {annotations[major.index(None)].image_id}): has no radius, "
-            "expected the disc's in px as radius, or radius_major and radius_minor"
-        )
-    table["radius_major"] = major
-    minor = [a.radius_minor for a in annotations]
-    table["radius_minor"] = (
-        major if all(m is None for m in minor) else [a if b is None else b for a, b in zip(major, minor, strict=True)]
-    )
-    table["axis_angle"] = [a.axis_angle for a in annotations]
-    table["visible"] = [a.visible for a in annotations]
+    table["patch_id"] = _column(annotations, "category_id", np.int64) - 1
+    for name in ("axis_angle", "visible"):
+        table[name] = _column(annotations, name)
+    radius, major, minor = (_column(annotations, name) for name in ("radius", "radius_major", "radius_minor"))
+    major = np.where(np.isnan(major), radius, major)
+    for n in np.flatnonzero(np.isnan(major)).tolist():
+        if annotations[n].radius is None and annotations[n].radius_major is None:
+            raise DataError(
+                f"annotations[{n}] (image_id {annotations[n].image_id}): has no radius, "
+                "expected the disc's in px as radius, or radius_major and radius_minor"
+            )
+    table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     fine = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
     if not fine.all():
         n = int(np.argmin(fine))
@@ -230,6 +232,21 @@ def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.
             f"is {table['radius_major'][n]}, expected finite numbers"
         )
     return table, points[:, 2] > 0
+
+
+def _column(entries: Sequence[Annotation | Result], name: str, kind: type = np.float64) -> NDArray[Any]:
+    """One field of all entries; nan where there is none."""
+    values = map(attrgetter(name), entries)
+    try:
+        return np.fromiter(values, kind, len(entries))
+    except TypeError:  # None among them
+        return np.array([getattr(entry, name) for entry in entries], kind)
+
+
+def _points(entries: Sequence[Annotation | Result]) -> NDArray[np.float64]:
+    """Rows x, y, v."""
+    points = chain.from_iterable(map(attrgetter("keypoints"), entries))
+    return np.fromiter(points, np.float64, 3 * len(entries)).reshape(-1, 3)
 
 
 def coco_results(data: bytes) -> Predictions:
@@ -263,11 +280,11 @@ def coco_results(data: bytes) -> Predictions:
 
 def _detections(batch: list[Result]) -> tuple[NDArray[Any], ...]:
     """Columns ``image_id, id, score, x, y`` of some results."""
-    points = np.fromiter(chain.from_iterable([r.keypoints for r in batch]), np.float64, 3 * len(batch)).reshape(-1, 3)
+    points = _points(batch)
     return (
-        np.array([r.image_id for r in batch], np.int64),
-        np.array([r.category_id for r in batch], np.float64) - 1,
-        np.array([r.score for r in batch], np.float64),
+        _column(batch, "image_id", np.int64),
+        _column(batch, "category_id") - 1,
+        _column(batch, "score"),
         points[:, 0],
         points[:, 1],
     )
