@@ -17,6 +17,7 @@ from kpbench.keypoints import UInt8
 __all__ = ["Source", "image_writer", "open_images"]
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> Source:
 
 @contextmanager
 def image_writer(target: Path | None, fps: float | None = None) -> Iterator[Callable[[str, UInt8], None]]:
-    """Write RGB images: into a folder as PNG under their names, or, if ``target`` ends in .mp4, as a video.
+    """Write RGB images: into a folder as PNG under their names, as a video (.mp4), or the only one as a picture (.png).
 
     Raises
     ------
@@ -99,13 +100,18 @@ def image_writer(target: Path | None, fps: float | None = None) -> Iterator[Call
         yield lambda name, image: None
         return
     try:
-        (target.parent if target.suffix.lower() in VIDEOS else target).mkdir(parents=True, exist_ok=True)
+        file = target.suffix.lower() in (*VIDEOS, *PICTURES) and not target.is_dir()
+        (target.parent if file else target).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{target}: cannot be written, {error.strerror}") from None
-    if target.suffix.lower() not in VIDEOS:
+    if not file or target.suffix.lower() in PICTURES:
+        written: list[str] = []
 
         def write_file(name: str, image: UInt8) -> None:
-            path = (target / name).with_suffix(".png")
+            if file and written:
+                raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
+            written.append(name)
+            path = target if file else (target / name).with_suffix(".png")
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
                 raise DataError(f"{path}: cannot be written")

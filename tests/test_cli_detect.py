@@ -84,6 +84,18 @@ def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
     ]
 
 
+def test_one_image_is_drawn_into_one_file_and_more_into_a_folder(folder, plug):
+    (folder / "two").mkdir()
+    for n in range(2):
+        cv2.imwrite(str(folder / "two" / f"{n}.png"), np.full((24, 32), 90, np.uint8))
+    result = run("two/0.png", "--detector", f"{plug}:brightest", "--overlay", "drawn.png")
+    assert result.exit_code == 0
+    assert cv2.imread("drawn.png").shape == (24, 32, 3)
+    refused = run("two", "--detector", f"{plug}:brightest", "--overlay", "other.png")
+    assert refused.exit_code == 1
+    assert "there is more than one image, expected a folder" in refused.output
+
+
 def test_a_video_and_its_overlay(folder, plug):
     writer = cv2.VideoWriter("in.mp4", cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
     for n in range(5):

@@ -26,7 +26,11 @@ __all__ = ["detect"]
 )
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
 @click.option("--threshold", type=FINITE, help="Drop detections of a lower score.")
-@click.option("--overlay", type=click.Path(path_type=Path), help="Draw detections: a folder, or a file ending in .mp4.")
+@click.option(
+    "--overlay",
+    type=click.Path(path_type=Path),
+    help="Draw detections: a folder, a video (.mp4), or for a single image a .png.",
+)
 @PATCHES
 @WORKERS
 def detect(
