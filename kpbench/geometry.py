@@ -14,10 +14,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kpbench.keypoints import Float
+from kpbench.keypoints import Float, UInt8
 
 __all__ = [
     "Camera",
@@ -27,6 +28,7 @@ __all__ = [
     "project",
     "projected_disc",
     "projected_discs",
+    "resize",
     "rotation_xyz",
 ]
 
@@ -175,3 +177,11 @@ class Camera:
         ])  # fmt: skip
         at = self.distort(np.array([[x, y]]))[0]
         return np.vstack([np.column_stack([J, at - J @ (x, y)]), [0.0, 0.0, 1.0]])
+
+
+def resize(grey: UInt8, width: int, height: int) -> UInt8:
+    """The image in another size; the outer corners of its corner pixels stay where they are."""
+    if grey.shape == (height, width):
+        return grey
+    how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=how), np.uint8)

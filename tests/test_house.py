@@ -28,7 +28,8 @@ LAYERS = [
     {"coco"},
     {"records"},
     {"predictions"},
-    {"synth", "suite", "samples", "recipe"},
+    {"synth", "suite", "crops"},
+    {"samples", "recipe"},
     {"match"},
     {"refine"},
     {"program"},
@@ -53,7 +54,19 @@ EVALUATOR = {
 }
 GENERATOR = {
     *("design", "cells", "board", "draw", "sheet", "sidecar", "tiling", "analysis", "search", "design_figure"),
-    *("background", "lookalikes", "tags", "scene", "degrade", "augment", "camera", "synth", "suite", "samples"),
+    *(
+        "background",
+        "lookalikes",
+        "tags",
+        "scene",
+        "degrade",
+        "augment",
+        "camera",
+        "synth",
+        "suite",
+        "crops",
+        "samples",
+    ),
 }
 TORCH = {"network", "train", "export"}
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench import samples
+from kpbench.crops import Disc, _paint_all, _poses
 from kpbench.design import shipped_patches
 from kpbench.geometry import projected_disc
 from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
@@ -58,8 +58,8 @@ def test_what_is_drawn_is_the_design_about_the_keypoint():
     """Ink at points of the patch, looked up through the pose, against the pixels of the crop."""
     canvas = np.full((96, 96), 128, np.uint8)
     H = np.array([[30.0, -4.0, 40.3], [6.0, 22.0, 50.8], [0.05, -0.08, 1.0]])
-    disc = samples.Disc(Placement(PATCHES[3], H, 10.0, 240.0), 3, H[0, 2], H[1, 2], 32.0, 20.0)
-    samples._paint_all([canvas], [[disc]])
+    disc = Disc(Placement(PATCHES[3], H, 10.0, 240.0), 3, H[0, 2], H[1, 2], 32.0, 20.0)
+    _paint_all([canvas], [[disc]])
     v, u = np.mgrid[-20:21, -20:21] / 21.0
     points = np.column_stack([u.ravel(), v.ravel()])[np.hypot(u, v).ravel() < 0.9]
     mapped = np.column_stack([points, np.ones(len(points))]) @ H.T
@@ -73,7 +73,7 @@ def test_what_is_drawn_is_the_design_about_the_keypoint():
 @given(st.integers(0, 2**31))
 def test_poses_keep_the_papers_limits_wherever_they_are_put(seed):
     limits, at = Limits(), np.array([[-4.0, 90.0], [30.0, 31.0]])
-    for H, place in zip(samples._poses(np.random.default_rng(seed), at, limits), at, strict=True):
+    for H, place in zip(_poses(np.random.default_rng(seed), at, limits), at, strict=True):
         assert H[:, 2] == pytest.approx([*place, 1], abs=1e-9)
         ellipse = projected_disc(H)
         assert 2 * ellipse.minor >= limits.minor_axis_px - 1e-6
@@ -84,7 +84,7 @@ def test_buried_keypoints_are_ignored_and_clean_ones_are_not(monkeypatch):
     clean = crops(3, 128).keypoints
     asked = clean[clean[..., 2] >= 0][:, 3] == 0
     assert 0.8 < asked.mean() < 1.0  # patches of a board may be smaller than the limits
-    monkeypatch.setattr(samples, "_degrade", lambda image, *_: (image, 1.0, 0.0, 1e6))
+    monkeypatch.setattr("kpbench.crops._degrade", lambda image, *_: (image, 1.0, 0.0, 1e6))
     batch = crops(0, 64)
     present = batch.keypoints[..., 2] >= 0
     assert (batch.keypoints[present][:, 3] > 4).all()

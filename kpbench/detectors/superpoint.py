@@ -23,6 +23,7 @@ from kpbench import verify
 from kpbench.design import parse_patch
 from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
+from kpbench.geometry import resize
 from kpbench.keypoints import Detections, Float, UInt8
 
 __all__ = [
@@ -34,7 +35,6 @@ __all__ = [
     "locate",
     "open_session",
     "pad_to_cells",
-    "resize",
 ]
 
 CELL = 8
@@ -136,14 +136,6 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     """Repeat the last row and column until both sides are multiples of 8; (0, 0) stays where it is."""
     height, width = grey.shape
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
-
-
-def resize(grey: UInt8, width: int, height: int) -> UInt8:
-    """The image in another size; the outer corners of its corner pixels stay where they are."""
-    if grey.shape == (height, width):
-        return grey
-    how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
-    return np.asarray(cv2.resize(grey, (width, height), interpolation=how), np.uint8)
 
 
 class Session(Protocol):
