@@ -2,13 +2,16 @@
 
 A network says where it sees a keypoint and which design it takes it for. Here all designs are laid over each
 such place (:mod:`kpbench.match`), the likeliest is fitted to the pixels (:mod:`kpbench.refine`), and both kinds of
-evidence together give the identity, the centre, and the probability that there is a patch.
+evidence together give the identity, the centre, and the probability that there is a patch: a logistic regression,
+which ``benchmarks/verification.py`` fits to synthetic images of training photographs.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +20,7 @@ from kpbench import match, refine
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
 
-__all__ = ["EVIDENCE", "Examined", "examine", "score"]
+__all__ = ["EVIDENCE", "Examined", "examine", "score", "terms"]
 
 EVIDENCE = (
     "log odds of the network's score",
@@ -33,9 +36,8 @@ EVIDENCE = (
 )
 """The columns of :attr:`Examined.evidence`."""
 
-WEIGHTS = np.array([0.521, 32.8, 0.253, 0.315, -0.618, -2.92, 0.417, -0.111, -0.146, 0.353])
-BIAS = -5.72
-"""Logistic regression: `benchmarks/verification.py` fits it to synthetic images from training photographs."""
+CLIP = 3.0
+"""Evidence is cut off at so many standard deviations: beyond what the fit has seen a square would run away."""
 
 LIKENESS_IN_ID = 0.3
 """What a unit of likeness weighs against a unit of the ID head's log probability when the design is chosen."""
@@ -133,7 +135,22 @@ def _core(levels: Sequence[NDArray[np.float32]], xy: Float, known: match.Bank) -
 
 def score(found: Examined) -> Float:
     """Probability (n,) that there is a patch, and that its centre and design are right."""
-    return np.asarray(1 / (1 + np.exp(-np.clip(found.evidence @ WEIGHTS + BIAS, -30, 30))))
+    fitted = _fitted()
+    logit = terms(found.evidence, fitted["mean"], fitted["deviation"]) @ fitted["weights"]
+    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -30, 30))))
+
+
+@cache
+def _fitted() -> dict[str, Float]:
+    with np.load(Path(__file__).parent / "weights" / "verification.npz") as columns:
+        return dict(columns)
+
+
+def terms(evidence: Float, mean: Float, deviation: Float) -> Float:
+    """What a logistic regression weighs: the evidence (n, E), standardised, its products by pairs, and 1."""
+    z = np.clip((evidence - mean) / deviation, -CLIP, CLIP)
+    first, second = np.triu_indices(z.shape[1])
+    return np.column_stack([z, z[:, first] * z[:, second], np.ones(len(z))])
 
 
 def _log_odds(probability: Float) -> Float:

@@ -199,7 +199,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
         raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
 
 
-CANDIDATE = 0.1
+CANDIDATE = 0.05
 """Least score of the network from which a place is worth verifying."""
 SCALES = (1.0, 0.5, 1.5)
 """Scales of the image at which candidates are looked for: small patches are found better enlarged, large ones shrunk.
