@@ -3,6 +3,7 @@
     python benchmarks/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
     python benchmarks/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
 
+The README's table and the figure show `paper-v1` at 640x480; results of another size are kept apart.
 Of a scores file only what the tables need is kept: all images, and every condition and rung.
 """
 
@@ -26,6 +27,8 @@ PAGE, FIGURE = ROOT / "docs" / "leaderboard.md", ROOT / "docs" / "severity.svg"
 ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
 METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
+QUICK_PX = (640, 480)
+"""The size of `kpbench bench --quick`; results of another size have a folder of their own."""
 PANEL = (480, 300)
 
 HEAD = """\
@@ -49,7 +52,9 @@ def take(folder: Path) -> None:
         for key in ("confusion", "curve"):
             del scores[key]
         scores["detector"].pop("failures", None)
-        target = RESULTS / path.parent.name / path.name
+        width, height = scores["provenance"]["config"]["size_px"]
+        folder_name = path.parent.name + (f"-{width}x{height}" if (width, height) != QUICK_PX else "")
+        target = RESULTS / folder_name / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(json.dumps(scores, sort_keys=True) + "\n")
 
@@ -173,9 +178,13 @@ def page(results: Path) -> tuple[str, str]:
             parts.append("![Detection score over severity](severity.svg)\n")
             picture = figure(runs)
         size = "x".join(map(str, config["size_px"]))
-        command = f"kpbench bench --suite {suite.name} --images {config['images']} --size {size}"
-        parts.append(f"## `{suite.name}`, {size}, {config['images']} scenes\n")
-        parts.append(f"Seed {config['seed']}, {config['backgrounds']['kind']} backgrounds: `{command}`\n")
+        command = f"kpbench bench --suite {config['suite']} --images {config['images']} --size {size}"
+        kind = config["backgrounds"]["kind"]
+        command += " --backgrounds PHOTOS" if kind == "photographs" else ""
+        parts.append(f"## `{config['suite']}`, {size}, {config['images']} scenes\n")
+        parts.append(
+            f"Seed {config['seed']}, {'photographs as' if kind == 'photographs' else kind} backgrounds: `{command}`\n"
+        )
         parts.append(to_markdown(overall(runs)))
         parts += [to_markdown(by_rung(runs, condition)) for condition in config["conditions"]]
     return "\n".join(parts), picture
