@@ -25,7 +25,17 @@ from torch import Tensor, nn
 from kpbench.errors import DataError
 from kpbench.recipe import Loss, NetworkConfig
 
-__all__ = ["CELL", "SuperPoint", "Targets", "initialise", "losses", "make_targets", "read_weights", "unfold"]
+__all__ = [
+    "CELL",
+    "SuperPoint",
+    "Targets",
+    "initialise",
+    "is_folded",
+    "losses",
+    "make_targets",
+    "read_weights",
+    "unfold",
+]
 
 CELL = 8
 """Side of a cell, px: three stages of the encoder halve the image."""
@@ -151,9 +161,9 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
         attached layers gets none. Weights without any BatchNorm are complete, see :func:`unfold`.
     """
     own = network.state_dict()
-    folded = not any(".bn." in name for name in weights)
+    bare = is_folded(weights)
     # the count of batches seen is no weight, and some files lack it
-    ours = {name for name in own if not (name.endswith("num_batches_tracked") or (folded and ".bn." in name))}
+    ours = {name for name in own if not (name.endswith("num_batches_tracked") or (bare and ".bn." in name))}
     wanted = {name for name in ours if "_attached" not in name}
     given = {name for name in weights if not name.endswith("num_batches_tracked")}
     for name in sorted(given - set(own)):
@@ -167,6 +177,11 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
     network.load_state_dict({name: weights[name] for name in given}, strict=False)
     fresh = sorted({name.split(".")[0] for name in ours - given})
     return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
+
+
+def is_folded(weights: dict[str, Tensor]) -> bool:
+    """Whether a state-dict has no BatchNorm, as that of an exported file."""
+    return not any(".bn." in name for name in weights)
 
 
 def unfold(network: SuperPoint, images: Tensor) -> None:

@@ -32,7 +32,7 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
-from kpbench.network import SuperPoint, initialise, losses, make_targets, read_weights, unfold
+from kpbench.network import SuperPoint, initialise, is_folded, losses, make_targets, read_weights, unfold
 from kpbench.recipe import Recipe, parse_recipe
 from kpbench.samples import Batch, Job, load_photos, make_batch, stream
 from kpbench.store import write_atomic
@@ -145,7 +145,8 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Ten
         model = onnx.load(path)
         content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
     except Exception as error:  # protobuf's own, which is not public, among others
-        raise DataError(f"{path}: cannot be read as an ONNX model ({str(error).splitlines()[0][:200]})") from None
+        why = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
     weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
     same = content.get("designs") == designs_digest(patches)
     return {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
@@ -337,7 +338,7 @@ def train(
     elif init is not None:
         weights = initial_weights(init, designs)
         say(initialise(state.network, weights, str(init)))
-        if not any(".bn." in name for name in weights):
+        if is_folded(weights):
             photos = load_photos(backgrounds, "training")
             batch = make_batch(recipe.samples, designs, photos, recipe.seed, 0, 128, recipe.phase(0)[1])
             unfold(state.network, _blob(torch.from_numpy(batch.images).to(device)))
