@@ -5,7 +5,8 @@
 The sets must come from photographs that are free for fitting: `kpbench synth --n 400 --backgrounds training/`.
 A place is right if its fitted centre lies within a tenth of the radius of a keypoint and its design is right.
 Prints, for each set, the detection score at several rates of false alarms, each quarter of the images under weights
-that were fitted to the other three: with and without verification. `--write` replaces
+that were fitted to the other three: with and without verification (a keypoint that two places explain counts
+twice here, as nothing is suppressed: hence figures over 1). `--write` replaces
 `kpbench/weights/verification.npz` by weights that were fitted to all.
 """
 
