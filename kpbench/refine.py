@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from kpbench.design import Patch
 from kpbench.keypoints import Float
-from kpbench.match import short_axis
 from kpbench.raster import Box, coverage
 
 __all__ = ["Fit", "fit"]
@@ -147,15 +146,19 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     ink = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), max(state.blur, 0.2), borderType=cv2.BORDER_REPLICATE)
     ink = ink[y0 - y : y1 - y, x0 - x : x1 - x]
     dx, dy = np.arange(x0, x1) - state.xy[0], np.arange(y0, y1)[:, None] - state.xy[1]
-    minor = float(short_axis(state.window[None])[0])
-    (a, b), (c, d) = np.linalg.inv(state.window) / max(extent - (0.35 + 0.8 * state.blur) / minor, 0.5)
-    inside = (a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < 1
+    minor = _short_axis(state.window)
+    reach = max(extent - (0.35 + 0.8 * state.blur) / minor, 0.5)
+    a, b, c, d = _inverse(state.window)
+    inside = (a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < reach**2
     grey, m = image[y0:y1, x0:x1][inside], ink[inside]
     if len(m) < 12:
         return state
-    slope, white = _line(m, grey)
-    residual = grey - (white + slope * m)
-    unexplained, spread = float(residual @ residual) / len(m), float(grey.var())
+    middle, level = float(m.mean()), float(grey.mean())
+    centred, about = m - np.float32(middle), grey - np.float32(level)
+    slope = float(centred @ about) / max(float(centred @ centred), 1e-6)
+    residual = about - np.float32(slope) * centred
+    unexplained, spread = float(residual @ residual) / len(m), float(about @ about) / len(m)
+    white = level - slope * middle
     ncc = np.sqrt(max(0.0, 1 - unexplained / max(spread, 1e-9))) * (1 if slope < 0 else -1)
     noise = float(np.sqrt(unexplained * len(m) / max(len(m) - 9, 1)))
     state = replace(state, black=white + slope, white=white, ncc=float(ncc), noise=noise)
@@ -168,22 +171,29 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
         return state
     at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
     gx, gy, dx, dy, m, residual = gx[edge], gy[edge], dx[at_x], dy[at_y, 0], m[edge], residual[edge]
-    (a, b), (c, d) = np.linalg.inv(state.A)
+    a, b, c, d = _inverse(state.A)
     u, v, outward = a * dx + b * dy, c * dx + d * dy, gx * dx + gy * dy
     shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace[edge] / 2)
     moves = np.stack([np.ones_like(m), m, *(slope * g for g in shifts)])
     # pixels that the model cannot explain (shadow edges, rain, what hides the patch) pull less
-    usual = 2.5 * 1.48 * float(np.median(np.abs(residual))) + 1.0
-    weighted = moves * np.minimum(1.0, usual / np.maximum(np.abs(residual), 1e-6))
+    size, half = np.abs(residual), len(residual) // 2
+    usual = 2.5 * 1.48 * float(np.partition(size, half)[half]) + 1.0
+    weighted = moves * np.minimum(1.0, usual / np.maximum(size, 1e-6))
     return _moved(state, weighted @ moves.T, weighted @ residual, minor)
 
 
-def _line(m: Float32, grey: Float32) -> tuple[float, float]:
-    """Slope and offset of the least-squares line of grey over m."""
-    middle = m.mean()
-    centred = m - middle
-    slope = float(centred @ grey) / max(float(centred @ centred), 1e-6)
-    return slope, float(grey.mean() - slope * middle)
+def _inverse(m: Float) -> tuple[float, float, float, float]:
+    """Row by row; for one 2x2 matrix many times faster than the general one."""
+    (a, b), (c, d) = m.tolist()
+    det = a * d - b * c or 1e-12
+    return d / det, -b / det, -c / det, a / det
+
+
+def _short_axis(m: Float) -> float:
+    """:func:`kpbench.match.short_axis` of one map."""
+    (a, b), (c, d) = m.tolist()
+    square, det = a * a + b * b + c * c + d * d, a * d - b * c
+    return float(np.sqrt(max(square - np.sqrt(max(square**2 - 4 * det**2, 0.0)), 1e-12) / 2))
 
 
 def _moved(state: _State, normal: Float, target: Float, minor: float) -> _State:
