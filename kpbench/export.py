@@ -14,9 +14,10 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from kpbench.detectors.superpoint import SCHEMA, open_session
+from kpbench.detectors.superpoint import SCHEMA
 from kpbench.errors import DataError
 from kpbench.network import CELL, SuperPoint
+from kpbench.runtime import open_session
 from kpbench.store import write_atomic
 from kpbench.train import network_of, read_checkpoint
 

@@ -1,0 +1,79 @@
+"""What runs a network of an ONNX file: ONNX Runtime, or OpenVINO."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Sequence
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.errors import DataError
+
+__all__ = ["Session", "open_session"]
+
+Float32 = NDArray[np.float32]
+
+
+class Session(Protocol):
+    """What runs a network: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
+
+    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
+        """All outputs for an input by name."""
+        ...
+
+
+class OpenVinoSession:
+    """A network compiled by OpenVINO for the processor."""
+
+    def __init__(self, model: bytes, threads: int) -> None:
+        import openvino
+
+        core, settings = openvino.Core(), {"INFERENCE_NUM_THREADS": threads}
+        self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
+
+    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
+        """All outputs for an input by name."""
+        results = self._compiled(feed)
+        return [np.array(results[output]) for output in self._compiled.outputs]
+
+
+RUNTIMES = ("auto", "cpu", "cuda", "openvino")
+
+
+def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
+    """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
+
+    The environment variable ``KPBENCH_RUNTIME`` chooses: "auto" (ONNX Runtime, on CUDA where the installed
+    package has it), "cpu", "cuda", or "openvino". 0 threads means as many as OpenCV may use: one in worker processes.
+
+    Raises
+    ------
+    DataError
+        If that runtime is not there.
+    """
+    import onnxruntime
+
+    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
+    if asked not in RUNTIMES:
+        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or cv2.getNumThreads()
+    options.log_severity_level = 3
+    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    if asked == "cuda" and not has_cuda:
+        raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
+    providers = ["CPUExecutionProvider"]
+    if has_cuda and asked in ("auto", "cuda"):
+        providers.insert(0, "CUDAExecutionProvider")
+    session = onnxruntime.InferenceSession(model, options, providers=providers)
+    content = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
+    if asked != "openvino":
+        return session, content
+    try:
+        return OpenVinoSession(model, threads or cv2.getNumThreads()), content
+    except ModuleNotFoundError:
+        raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
