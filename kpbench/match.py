@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
@@ -39,6 +40,7 @@ __all__ = [
     "pyramid",
     "search",
     "short_axis",
+    "view",
 ]
 
 Float32 = NDArray[np.float32]
@@ -96,6 +98,7 @@ class Bank:
     whole : the whole design, over the unit disc.
     turned : (R, M) all rotations of all cores, without those that look alike.
     turned_which, turned_angle : (R,) the design and the rotation in radians of each.
+    picture : (D, VIEW_PX²) the designs as :func:`view` shows them, white 1 and black -1.
     """
 
     patches: tuple[Patch, ...]
@@ -104,6 +107,7 @@ class Bank:
     turned: Float32
     turned_which: Ints
     turned_angle: Float
+    picture: Float32
 
 
 def bank(patches: Sequence[Patch]) -> Bank:
@@ -125,7 +129,8 @@ def _bank(patches: tuple[Patch, ...]) -> Bank:
                 angle.append(_turn[k])
         turned += seen
     whole = _templates(patches, (0.25, 0.45, 0.65, 0.85), whole=True)
-    return Bank(patches, core, whole, np.array(turned), np.array(which, np.int64), np.array(angle))
+    picture = np.array([_look_up(_soft_ink(patch, True), _view_points()) for patch in patches], np.float32)
+    return Bank(patches, core, whole, np.array(turned), np.array(which, np.int64), np.array(angle), picture)
 
 
 def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
@@ -223,8 +228,8 @@ def _outside(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Ints, 
     last = np.array(image.shape[::-1]) - 1.0
     reach = np.linalg.norm(A, axis=2) * np.linalg.norm(points, axis=1).max()
     rows = np.flatnonzero(np.any((xy - reach < 0) | (xy + reach > last), axis=1))
-    at = xy[rows, None] + points @ np.swapaxes(A[rows], 1, 2)
-    return rows, np.any((at < 0) | (at > last), axis=2)
+    x, y = (A[rows, axis] @ points.T + xy[rows, axis, None] for axis in (0, 1))
+    return rows, (x < 0) | (y < 0) | (x > last[0]) | (y > last[1])
 
 
 FLOOR = 1.0
@@ -356,8 +361,39 @@ def _level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Ints
     return np.clip(octave, 0, len(levels) - 1).astype(np.int64)
 
 
-SPOKES = 48
-RADII = 0.7 * 1.12 ** np.arange(44)
+VIEW_PX = 32
+"""Side of a view, which reaches from -1.7 to 1.7 in the patch frame: the disc and what surrounds it."""
+
+
+@lru_cache(maxsize=1)
+def _view_points() -> Float:
+    ticks = ((np.arange(VIEW_PX) + 0.5) / VIEW_PX * 2 - 1) * LOOKUP_HALF
+    return np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+
+
+def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank) -> tuple[Float32, Float]:
+    """What the image shows in the frame of a patch: upright, undistorted, and free of its inks.
+
+    Returns
+    -------
+    (N, VIEW_PX²) ink, white 1 and black -1 by the least-squares line over the disc, clipped to ±2.5; (N,) half of the
+    contrast, grey levels, at least 2.
+    """
+    points = _view_points()
+    px = short_axis(A) * 2 * LOOKUP_HALF / VIEW_PX
+    level = np.clip(np.rint(np.log2(np.maximum(px, 1e-6))), 0, len(levels) - 1).astype(np.int64)
+    grey = _sample(levels, level, xy, A, points)
+    disc = np.hypot(*points.T) < 1
+    model = known.picture[which][:, disc]
+    centred = model - model.mean(axis=1, keepdims=True)
+    slope = np.einsum("nm,nm->n", grey[:, disc], centred) / np.einsum("nm,nm->n", centred, centred)
+    slope = np.maximum(slope, 2.0)
+    middle = grey[:, disc].mean(axis=1) - slope * model.mean(axis=1)
+    return np.clip((grey - middle[:, None]) / slope[:, None], -2.5, 2.5), slope.astype(np.float64)
+
+
+SPOKES = 40
+RADII = 0.7 * 1.12 ** np.arange(34)
 """Radii at which :func:`extend` looks, in radii of the circle that was aligned."""
 AGREE = 0.7
 """Fraction of a circle's samples that must have the predicted ink for it to belong to the patch."""
@@ -370,34 +406,31 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
     with the largest sum of votes is the sectors' edge. Two edges leave the stretch along each of them open,
     so ellipses are tried that differ in it; three or more edges leave the size alone.
     """
-    turn = np.arange(SPOKES) * (2 * np.pi / SPOKES)
-    spokes = np.column_stack([np.cos(turn), np.sin(turn)])
-    votes = _votes(levels, poses, known, spokes)
-    summed = np.cumsum(votes * (RADII * np.gradient(RADII))[:, None], axis=1)
-    good, cast = votes > 0, votes != 0
+    votes = _votes(levels, poses, known)
+    summed = np.cumsum(votes * (RADII * np.gradient(RADII)).astype(np.float32)[:, None], axis=1)
     A = poses.A.copy()
     for d, patch in enumerate(known.patches):
         rows = np.flatnonzero(poses.which == d)
-        shapes = _stretches(patch)
-        reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), spokes), axis=2)
-        shift = np.rint(np.log(reach) / np.log(RADII[1] / RADII[0])).astype(np.int64)
-        ring = np.clip(np.arange(len(RADII))[:, None] + shift[:, None], 0, len(RADII) - 1)  # (G, radii, spokes)
-        total, yes, all_ = np.zeros((3, len(rows), *ring.shape[:2]))
-        for s in range(SPOKES):
-            for table, source in ((total, summed), (yes, good), (all_, cast)):
-                table += source[rows, :, s][:, ring[..., s]]
+        shapes, ends = _ellipses(patch)
+        # (radii x spokes, rows) of what the votes add up to, those in favour, and all that were cast
+        tables = [t[rows].reshape(len(rows), len(RADII) * SPOKES).T for t in (summed, votes > 0, votes != 0)]
+        total, yes, cast = (
+            (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), len(RADII)) for t in tables
+        )
         # beyond the first circle that disagrees, what agrees is chance
-        alien = np.logical_or.accumulate((yes < AGREE * all_) | (yes < 0.3 * SPOKES), axis=2)
+        alien = np.logical_or.accumulate((yes < AGREE * cast) | (yes < 0.3 * SPOKES), axis=2)
         alien[:, :, 0] = False
-        best = np.where(alien, -np.inf, total).reshape(len(rows), ring.shape[0] * ring.shape[1]).argmax(axis=1)
-        shape, size = np.unravel_index(best, ring.shape[:2])
+        best = np.where(alien, -np.inf, total).reshape(len(rows), len(shapes) * len(RADII)).argmax(axis=1)
+        shape, size = np.unravel_index(best, (len(shapes), len(RADII)))
         A[rows] = A[rows] @ (shapes[shape] * RADII[size][:, None, None]) / patch.cells[0][1]
     return Poses(poses.xy, A, poses.which, poses.ncc)
 
 
-def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, spokes: Float) -> Float:
+def _votes(levels: Sequence[Float32], poses: Poses, known: Bank) -> Float32:
     """From -1.4 (the other ink) to 0.6 (the predicted ink), 0 outside the image: (N, radii, spokes)."""
-    predicted = np.stack([_look_up(_soft_ink(p, False), spokes) for p in known.patches])[poses.which][:, None]
+    spokes = _spokes()
+    ink = np.array([_look_up(_soft_ink(p, False), spokes) for p in known.patches], np.float32)
+    predicted = ink[poses.which][:, None]
     shape = (len(poses), len(RADII), len(spokes))
     xy = np.repeat(poses.xy, len(RADII), axis=0)
     A = (poses.A[:, None] * RADII[:, None, None]).reshape(-1, 2, 2)
@@ -407,11 +440,32 @@ def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, spokes: Float) 
     white = (core * light).sum(axis=1) / light.sum(axis=1)
     black = (core * ~light).sum(axis=1) / (~light).sum(axis=1)
     middle, half = (white + black) / 2, np.maximum((white - black) / 2, 1.0)
-    agree = np.clip((grey - middle[:, None, None]) / half[:, None, None] * np.sign(predicted), -1, 1)
-    votes = np.asarray((agree - 0.4) * np.abs(predicted))
+    agree = grey - middle.astype(np.float32)[:, None, None]
+    agree *= np.sign(predicted) / half.astype(np.float32)[:, None, None]
+    np.clip(agree, -1, 1, out=agree)
+    agree -= np.float32(0.4)
+    votes: Float32 = agree * np.abs(predicted)
     rows, outside = _outside(levels[0], xy, A, spokes)
     votes.reshape(-1, len(spokes))[rows] *= ~outside
     return votes
+
+
+@lru_cache(maxsize=64)
+def _ellipses(patch: Patch) -> tuple[Float, csr_array]:
+    """Shapes (G, 2, 2) that are tried, and the samples where each one ends: (G x radii, radii x spokes), 0 or 1."""
+    shapes = _stretches(patch)
+    reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spokes()), axis=2)
+    shift = np.rint(np.log(reach) / np.log(RADII[1] / RADII[0])).astype(np.int64)
+    ring = np.clip(np.arange(len(RADII))[:, None] + shift[:, None], 0, len(RADII) - 1)  # (G, radii, spokes)
+    column = (ring * SPOKES + np.arange(SPOKES)).ravel()
+    row = np.repeat(np.arange(len(column) // SPOKES), SPOKES)
+    ends = csr_array((np.ones(len(column), np.float32), (row, column)), (row[-1] + 1, len(RADII) * SPOKES))
+    return shapes, ends
+
+
+def _spokes() -> Float:
+    turn = np.arange(SPOKES) * (2 * np.pi / SPOKES)
+    return np.column_stack([np.cos(turn), np.sin(turn)])
 
 
 @lru_cache(maxsize=64)

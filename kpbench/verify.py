@@ -1,9 +1,11 @@
 """Verification: what the pixels say of the points that a network found.
 
-A network says where it sees a keypoint and which design it takes it for. Here all designs are laid over each
-such place (:mod:`kpbench.match`), the likeliest is fitted to the pixels (:mod:`kpbench.refine`), and both kinds of
-evidence together give the identity, the centre, and the probability that there is a patch: a logistic regression,
-which ``benchmarks/verification.py`` fits to synthetic images of training photographs.
+A network says where it sees a keypoint and which design it takes it for. Here the likely designs are laid over
+each such place (:func:`posed`, with :mod:`kpbench.match`), what still looks like a patch is fitted to the pixels
+(:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a small network judges: it sees the place in
+the frame of the patch, beside the design, and what was measured. Its answer is the probability that there is a
+patch of this design at this place. ``benchmarks/verification.py`` trains the judges on synthetic images of training
+photographs.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,36 +22,101 @@ from numpy.typing import NDArray
 from kpbench import match, refine
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
+from kpbench.runtime import Session, open_session
 
-__all__ = ["EVIDENCE", "Examined", "examine", "score", "terms"]
+__all__ = [
+    "FITTED",
+    "POSED",
+    "Examined",
+    "Hypotheses",
+    "Picture",
+    "examine",
+    "fitted",
+    "inputs",
+    "judged",
+    "posed",
+    "worth_a_fit",
+]
 
-EVIDENCE = (
+POSED = (
     "log odds of the network's score",
     "log probability that the ID head sees a patch",
-    "likeness of the coarse match",
-    "-log(1.01 - correlation of the fit)",
-    "log of what the fit leaves unexplained, in contrasts",
-    "blur in short semi-axes",
-    "log of contrast over the range of the image",
+    "log probability of the design by the ID head",
+    "-log(1.01 - correlation of the innermost sectors)",
+    "-log(1.01 - correlation of the whole design)",
     "log of the distance from the network's place, in short semi-axes",
+    "log of contrast over the range of the image",
     "log of contrast over noise",
     "log of the short semi-axis, px",
 )
-"""The columns of :attr:`Examined.evidence`."""
+"""The columns of the evidence of :func:`posed`."""
+FITTED = (
+    *POSED,
+    "-log(1.01 - correlation of the fit)",
+    "log of what the fit leaves unexplained, in contrasts",
+    "blur in short semi-axes",
+    "log of the distance from the network's place, in short semi-axes, by the fit",
+    "log of contrast over the range of the image, by the fit",
+    "log of contrast over noise, by the fit",
+    "log of the short semi-axis, px, by the fit",
+)
+"""The columns of the evidence of :func:`fitted`."""
 
-CLIP = 3.0
-"""Evidence is cut off at so many standard deviations: beyond what the fit has seen a square would run away."""
-
-LIKENESS_IN_ID = 0.3
-"""What a unit of likeness weighs against a unit of the ID head's log probability when the design is chosen."""
-HOPE, HOPELESS = np.array([0.57, 12.3, 0.24]), -0.4
-"""What the first three of the evidence weigh before the fit, and the sum under which a place is not worth one."""
+OCTAVES = 4
+"""Octaves in which a patch's core is looked for: short semi-axes from 5 px."""
+DOUBT = 3.0
+"""Designs whose log-probability by the ID head is further behind the likeliest one's are not tried."""
+LIKENESS_IN_ID, FARNESS = 0.3, 2.0
+"""What a unit of likeness weighs against a unit of the ID head's log probability when a design and its octave are
+chosen, and what a unit of log distance from the network's place, px, weighs against a unit of likeness."""
+TRIED = 3
+"""Hypotheses a place that are judged before the fit."""
+HOPELESS = 0.003
+"""Probability before the fit under which a place is not worth one."""
 FAINTEST = 2.0
 """Grey levels between the inks under which nothing that is fitted means anything."""
-OCTAVES = 2
-"""Best octaves by the coarse search of which each is aligned before one is chosen."""
 LEAST_FIT = 0.7
 """Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
+
+
+class Picture:
+    """A grey image and what is needed of it again and again."""
+
+    def __init__(self, grey: UInt8) -> None:
+        self.raw, self.smooth = match.pyramid(grey, 0), match.pyramid(grey)
+        self.noise = match.noise(self.raw[0])
+        dark, bright = np.percentile(grey[::4, ::4], (2, 98))
+        self.range = float(bright - dark)
+
+    def contrasts(self, contrast: Float) -> list[Float]:
+        """Logs of contrasts (n,), grey levels, over the range of the image and over its noise."""
+        return [np.log(contrast / (self.range + 5)), np.log(contrast / (self.noise + 1))]
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """n places, each with the design and the pose that it is taken for.
+
+    Attributes
+    ----------
+    place : (n,) index of the place that was asked about.
+    at : (n, 2) px, that place.
+    which : (n,) index of the design.
+    xy, A : (n, 2) px, (n, 2, 2) patch frame to px.
+    view : (n, VIEW_PX²) from :func:`kpbench.match.view`.
+    evidence : (n, len(POSED)) or (n, len(FITTED))
+    """
+
+    place: NDArray[np.int64]
+    at: Float
+    which: NDArray[np.int64]
+    xy: Float
+    A: Float
+    view: NDArray[np.float32]
+    evidence: Float
+
+    def __getitem__(self, keep: Any) -> Hypotheses:
+        return Hypotheses(*(column[keep] for column in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -61,18 +129,18 @@ class Examined:
     which : (n,) index of the likeliest design.
     xy : (n, 2) px, the fitted centre, or the place itself where the fit is not to be trusted.
     minor_px : (n,) short semi-axis of the fitted disc.
-    evidence : (n, len(EVIDENCE))
+    score : (n,) probability that there is a patch, and that its centre and design are right.
     """
 
     place: NDArray[np.int64]
     which: NDArray[np.int64]
     xy: Float
     minor_px: Float
-    evidence: Float
+    score: Float
 
 
 def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Examined:
-    """Compare places with all designs, and fit the likeliest.
+    """Compare places with all designs, and fit what looks like one.
 
     Parameters
     ----------
@@ -82,75 +150,109 @@ def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches
     log_id : ndarray of shape (n, len(patches) + 1): log-probability of each design, and of none.
     patches : the designs.
     """
-    known = match.bank(patches)
-    raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
-    core = _core(smooth, xy, known)
-    whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
-    likeness = match.likeness(core.ncc, whole.ncc).reshape(len(xy), len(patches))
-    which = np.argmax(log_id[:, :-1] + LIKENESS_IN_ID * likeness, axis=1)
-    patch_seen = np.log(np.maximum(1 - np.exp(log_id[:, -1]), 1e-4))
-    before = np.column_stack([_log_odds(network_score), patch_seen, likeness[np.arange(len(xy)), which]])
-    place = np.flatnonzero(before @ HOPE > HOPELESS)
+    picture = Picture(grey)
+    before = posed(picture, xy, network_score, log_id, patches)
+    found = fitted(picture, before[worth_a_fit(before, judged("posed", before, patches))], patches)
+    minor = _minor(found.A)
+    correlation = 1.01 - np.exp(-found.evidence[:, len(POSED)])
+    near = np.linalg.norm(found.xy - found.at, axis=1) <= np.maximum(3.0, 0.35 * minor)
+    centres = np.where(((correlation >= LEAST_FIT) & near)[:, None], found.xy, found.at)
+    return Examined(found.place, found.which, centres, minor, judged("fitted", found, patches))
 
-    poses = whole[place * len(patches) + which[place]]
-    fit = refine.fit(raw, poses.xy, poses.A, [patches[n] for n in poses.which])
+
+def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Hypotheses:
+    """Up to three designs and poses for every place, as good as any (parameters as for :func:`examine`).
+
+    The circles of an octave that is not the patch's show the background, which can look like any core. So every
+    octave's pose is laid over the whole disc before some are chosen, and moving far from the place counts against it.
+    """
+    known, levels = match.bank(patches), picture.smooth
+    octaves, designs = min(OCTAVES, len(levels)), len(patches)
+    level = np.repeat(np.arange(octaves), len(xy))
+    cores = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=2.0)  # all designs at each
+    place, which = np.nonzero(log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT)
+    tried = (np.arange(octaves)[:, None] * len(xy) * designs + place * designs + which).ravel()
+    cores = match.align(levels, cores[tried], known.core, 3, 0.9 * match.RING_PX)
+    whole = match.align(levels, match.extend(levels, cores, known), known.whole, 4, 5.6)
+
+    place = np.tile(place, octaves)
+    moved = np.linalg.norm(whole.xy - xy[place], axis=1)
+    likeness = match.likeness(cores.ncc, whole.ncc) - FARNESS * np.log(moved + 0.5)
+    value = log_id[place, whole.which] + LIKENESS_IN_ID * likeness
+    order = np.lexsort((-value, place))
+    rank = np.arange(len(order)) - np.searchsorted(place[order], place[order])
+    best = order[rank < TRIED]
+    poses, which, place = whole[best], whole.which[best], place[best]
+
+    view, contrast = match.view(levels, poses.xy, poses.A, which, known)
+    minor = _minor(poses.A)
+    evidence = np.column_stack(
+        [
+            _log_odds(network_score[place]),
+            np.log(np.maximum(1 - np.exp(log_id[place, -1]), 1e-4)),
+            log_id[place, which],
+            -np.log(1.01 - cores.ncc[best]),
+            -np.log(1.01 - poses.ncc),
+            np.log(moved[best] / minor + 0.02),
+            *picture.contrasts(contrast),
+            np.log(minor),
+        ]
+    )
+    return Hypotheses(place, xy[place], which, poses.xy, poses.A, view, evidence)
+
+
+def worth_a_fit(before: Hypotheses, probability: Float) -> NDArray[np.int64]:
+    """The likeliest hypothesis of every place (indices), without the hopeless ones."""
+    order = np.lexsort((-probability, before.place))
+    likeliest = order[np.flatnonzero(np.diff(before.place[order], prepend=-1))]
+    return likeliest[probability[likeliest] >= HOPELESS]
+
+
+def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
+    """Hypotheses with the pose that fits the pixels best, without those that are too faint for a fit."""
+    fit = refine.fit(picture.raw, before.xy, before.A, [patches[n] for n in before.which])
     seen = np.flatnonzero(fit.white - fit.black > FAINTEST)
-    place, fit = place[seen], fit[seen]
-    minor = np.maximum(match.short_axis(fit.A), 0.5)
-    moved = np.linalg.norm(fit.xy - xy[place], axis=1)
-    trusted = (fit.ncc >= LEAST_FIT) & (moved <= np.maximum(3.0, 0.35 * minor))
-    centres = np.where(trusted[:, None], fit.xy, xy[place])
-    evidence = np.column_stack([before[place], _evidence(grey, raw[0], fit, minor, moved)])
-    return Examined(place, which[place], centres, minor, np.nan_to_num(evidence))
-
-
-def _evidence(grey: UInt8, image: NDArray[np.float32], fit: refine.Fit, minor: Float, moved: Float) -> Float:
-    """The columns of :data:`EVIDENCE` that come from the fit."""
-    contrast, noise = fit.white - fit.black, match.noise(image)
-    dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-    unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - noise**2, 0)) / contrast, 3.0)
-    return np.column_stack(
+    before, fit = before[seen], fit[seen]
+    contrast, minor = fit.white - fit.black, _minor(fit.A)
+    moved = np.linalg.norm(fit.xy - before.at, axis=1)
+    unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - picture.noise**2, 0)) / contrast, 3.0)
+    measured = np.column_stack(
         [
             -np.log(1.01 - fit.ncc),
             np.log(unexplained + 0.02),
             np.minimum(fit.blur_px / minor, 1.0),
-            np.log(contrast / (bright - dark + 5)),
             np.log(moved / minor + 0.02),
-            np.log(contrast / (noise + 1)),
+            *picture.contrasts(contrast),
             np.log(minor),
         ]
     )
+    view, _ = match.view(picture.smooth, fit.xy, fit.A, before.which, match.bank(patches))
+    evidence = np.column_stack([before.evidence, np.nan_to_num(measured)])
+    return Hypotheses(before.place, before.at, before.which, fit.xy, fit.A, view, evidence)
 
 
-def _core(levels: Sequence[NDArray[np.float32]], xy: Float, known: match.Bank) -> match.Poses:
-    """The best pose of every design's core at every place, (n * designs), over four octaves."""
-    octaves, count = min(4, len(levels)), len(xy) * len(known.patches)
-    level = np.repeat(np.arange(octaves), len(xy))
-    poses = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=2.0)  # all designs at each
-    likeliest = np.argsort(-poses.ncc.reshape(octaves, count), axis=0, kind="stable")[:OCTAVES]
-    poses = poses[(likeliest * count + np.arange(count)).ravel()]
-    poses = match.align(levels, poses, known.core, 3, 0.9 * match.RING_PX)
-    return poses[poses.ncc.reshape(-1, count).argmax(axis=0) * count + np.arange(count)]
+def judged(stage: str, found: Hypotheses, patches: Sequence[Patch]) -> Float:
+    """Probability (n,) that there is a patch, and that its centre and design are right, after a stage."""
+    if not len(found.place):
+        return np.zeros(0)
+    logit = _judge(stage).run(None, inputs(found, patches))[0]
+    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -30, 30))), np.float64)
 
 
-def score(found: Examined) -> Float:
-    """Probability (n,) that there is a patch, and that its centre and design are right."""
-    fitted = _fitted()
-    logit = terms(found.evidence, fitted["mean"], fitted["deviation"]) @ fitted["weights"]
-    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -30, 30))))
+def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
+    """What a judge looks at: ``view`` (n, 2, 32, 32), the place and the design, and ``evidence`` (n, columns)."""
+    side = match.VIEW_PX
+    pair = np.stack([found.view, match.bank(patches).picture[found.which]], axis=1)
+    return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
 
 
 @cache
-def _fitted() -> dict[str, Float]:
-    with np.load(Path(__file__).parent / "weights" / "verification.npz") as columns:
-        return dict(columns)
+def _judge(stage: str) -> Session:
+    return open_session((Path(__file__).parent / "weights" / f"{stage}.onnx").read_bytes(), 1)[0]
 
 
-def terms(evidence: Float, mean: Float, deviation: Float) -> Float:
-    """What a logistic regression weighs: the evidence (n, E), standardised, its products by pairs, and 1."""
-    z = np.clip((evidence - mean) / deviation, -CLIP, CLIP)
-    first, second = np.triu_indices(z.shape[1])
-    return np.column_stack([z, z[:, first] * z[:, second], np.ones(len(z))])
+def _minor(A: Float) -> Float:
+    return np.maximum(match.short_axis(A), 0.5)
 
 
 def _log_odds(probability: Float) -> Float:

@@ -10,8 +10,9 @@ from onnx import TensorProto, helper
 
 from kpbench.design import shipped_patches
 from kpbench.detect import load_detector
-from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, open_session, pad_to_cells
+from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells
 from kpbench.errors import DataError
+from kpbench.runtime import open_session
 
 PATCHES = shipped_patches()
 

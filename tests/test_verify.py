@@ -31,7 +31,7 @@ def test_the_fit_finds_the_centre_to_a_fiftieth_of_a_pixel():
     found = examined(image, np.add(xy, [[0.9, -0.8], [-1.0, 1.2]]), which)
     np.testing.assert_allclose(found.xy, xy, atol=0.02)
     assert found.which.tolist() == which
-    assert np.all(verify.score(found) > 0.9)
+    assert np.all(found.score > 0.9)
 
 
 @pytest.mark.parametrize("said", range(4))
@@ -44,7 +44,7 @@ def test_what_is_no_patch_scores_low_and_stays_where_it_was():
     image, xy, which = scene()
     place = [[xy[0, 0] + 8, xy[0, 1]]]  # 8 px beside a centre
     found = examined(image, place, which[:1])
-    assert verify.score(found)[0] < 0.5
+    assert found.score[0] < 0.5
     np.testing.assert_array_equal(found.xy, place)
 
 
@@ -57,6 +57,25 @@ def test_hopeless_places_are_not_fitted():
     assert len(examined(image, [[20.0, 100.0]], [0], sure=0.01).place) == 0
 
 
-def test_evidence_has_a_column_for_each_name():
-    image, xy, which = scene()
-    assert examined(image, xy, which).evidence.shape == (2, len(verify.EVIDENCE))
+def test_a_small_patch_is_not_taken_for_a_large_one_that_the_background_resembles():
+    """The core of octave 3, 24 px, can fit the background better than that of octave 0 fits the patch."""
+    ground = np.full((160, 160), 60, np.uint8)
+    ground[:80, :80] = ground[80:, 80:] = 200  # a chequer whose middle is the patch's own place
+    small = Placement(PATCHES[2], np.array([[6.0, 0.5, 80.3], [-0.5, 6.0, 79.6], [0.0, 0.0, 1.0]]), 20.0, 230.0)
+    rendered = render_scene(ground, [small])
+    xy = np.column_stack([rendered.keypoints["x"], rendered.keypoints["y"]])
+    found = examined(rendered.image, xy + 0.7, [2], sure=0.99)
+    np.testing.assert_allclose(found.xy, xy, atol=0.05)
+    assert found.minor_px[0] == pytest.approx(rendered.keypoints["radius_minor"][0], rel=0.05)
+
+
+def test_evidence_has_a_column_for_each_name_and_none_for_no_places():
+    image, xy, _ = scene()
+    log_id = np.log(np.full((2, len(PATCHES) + 1), 0.2))
+    picture = verify.Picture(image)
+    for count in (2, 0):
+        posed = verify.posed(picture, xy[:count], np.full(count, SURE), log_id[:count], PATCHES)
+        assert posed.evidence.shape == (verify.TRIED * count, len(verify.POSED))
+        fitted = verify.fitted(picture, posed, PATCHES)
+        assert fitted.evidence.shape == (len(posed.place), len(verify.FITTED))
+        assert verify.judged("fitted", fitted, PATCHES).shape == (len(posed.place),)

@@ -7,13 +7,11 @@ it, whichever cells that lies in.
 
 from __future__ import annotations
 
-import io
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
@@ -25,6 +23,7 @@ from kpbench.detect import suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.geometry import resize
 from kpbench.keypoints import Detections, Float, UInt8
+from kpbench.runtime import open_session
 
 __all__ = [
     "Decoding",
@@ -33,7 +32,6 @@ __all__ = [
     "decode",
     "identify",
     "locate",
-    "open_session",
     "pad_to_cells",
 ]
 
@@ -138,73 +136,10 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
-class Session(Protocol):
-    """What runs a network: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
-
-    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """All outputs for an input by name."""
-        ...
-
-
-class OpenVinoSession:
-    """A network compiled by OpenVINO for the processor."""
-
-    def __init__(self, model: bytes, threads: int) -> None:
-        import openvino
-
-        core, settings = openvino.Core(), {"INFERENCE_NUM_THREADS": threads}
-        self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
-
-    def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """All outputs for an input by name."""
-        results = self._compiled(feed)
-        return [np.array(results[output]) for output in self._compiled.outputs]
-
-
-RUNTIMES = ("auto", "cpu", "cuda", "openvino")
-
-
-def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
-    """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
-
-    The environment variable ``KPBENCH_RUNTIME`` chooses: "auto" (ONNX Runtime, on CUDA where the installed
-    package has it), "cpu", "cuda", or "openvino". 0 threads means as many as OpenCV may use: one in worker processes.
-
-    Raises
-    ------
-    DataError
-        If that runtime is not there.
-    """
-    import onnxruntime
-
-    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
-    if asked not in RUNTIMES:
-        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or cv2.getNumThreads()
-    options.log_severity_level = 3
-    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-    if asked == "cuda" and not has_cuda:
-        raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
-    providers = ["CPUExecutionProvider"]
-    if has_cuda and asked in ("auto", "cuda"):
-        providers.insert(0, "CUDAExecutionProvider")
-    session = onnxruntime.InferenceSession(model, options, providers=providers)
-    content = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
-    if asked != "openvino":
-        return session, content
-    try:
-        return OpenVinoSession(model, threads or cv2.getNumThreads()), content
-    except ModuleNotFoundError:
-        raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
-
-
-CANDIDATE = 0.05
+CANDIDATE = 0.015
 """Least score of the network from which a place is worth verifying."""
-SCALES = (1.0, 0.5, 1.5)
-"""Scales of the image at which candidates are looked for: small patches are found better enlarged, large ones shrunk.
-
-``scales=(1.0,)`` takes a third of the network's time and misses more of both."""
+SCALES = (1.0, 0.5)
+"""Scales of the image at which candidates are looked for: large patches are found better shrunk."""
 SAME_PX = 3.0
 """Candidates of two scales that are nearer to each other than this are one."""
 
@@ -276,41 +211,45 @@ class SuperPointDetector:
             raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         if not greys or not greys[0].size:
             return [Detections.none() for _ in greys]
-        height, width = greys[0].shape
-        sizes = [(round(scale * width), round(scale * height)) for scale in (self.scales if self.verified else (1.0,))]
-        views = [[resize(grey, max(1, w), max(1, h)) for grey in greys] for w, h in sizes]
-        # what rounding to whole pixels makes of the scales in x and y
-        scales = [np.divide(view[0].shape, greys[0].shape)[::-1] for view in views]
-        by_scale = [zip(*self.heads(view), strict=True) for view in views]
-        return [self._decoded(grey, heads, scales) for grey, *heads in zip(greys, *by_scale, strict=True)]
+        return [self._decoded(grey, *seen) for grey, seen in zip(greys, self.candidates(greys), strict=True)]
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         """The two raw heads of several grey images of one size: (B, 65, h, w) and (B, ids + 1, h, w)."""
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         return self._session.run(None, {"image": blob})
 
-    def _decoded(self, grey: UInt8, heads: Sequence[tuple[Float32, Float32]], scales: Sequence[Float]) -> Detections:
+    def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
+        """Where the network sees something, for each of several grey images of one size.
+
+        Returns
+        -------
+        Places (n, 2) px, their scores (n,), and log-probabilities (n, ids + 1) of each design and of none; best first.
+        """
         how = Decoding(CANDIDATE if self.verified else self.threshold)
-        height, width = grey.shape
-        places, scores, identities = list[Float](), list[Float](), list[Float]()
-        for (detector, ids), scale in zip(heads, scales, strict=True):
-            there, score = locate(detector, how)
-            xy = (there + 0.5) / scale - 0.5
-            inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
-            places.append(xy[inside])
-            scores.append(score[inside])
-            identities.append(identify(ids, there[inside]))
-        xy, score, log_id = np.concatenate(places), np.concatenate(scores), np.concatenate(identities)
-        once = suppress(xy, score, SAME_PX)
-        xy, score, log_id = xy[once], score[once], log_id[once]
+        height, width = greys[0].shape
+        found: list[list[tuple[Float, Float, Float]]] = [[] for _ in greys]
+        for scale in self.scales if self.verified else (1.0,):
+            size = max(1, round(scale * width)), max(1, round(scale * height))
+            exact = np.divide(size, (width, height))  # what rounding to whole pixels makes of the scale
+            heads = self.heads([resize(grey, *size) for grey in greys])
+            for parts, detector, ids in zip(found, *heads, strict=True):
+                there, score = locate(detector, how)
+                xy = (there + 0.5) / exact - 0.5
+                inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
+                parts.append((xy[inside], score[inside], identify(ids, there[inside])))
+        columns = [[np.concatenate(column) for column in zip(*parts, strict=True)] for parts in found]
+        once = [suppress(xy, score, SAME_PX) for xy, score, _ in columns]
+        return [(xy[k], score[k], log_id[k]) for (xy, score, log_id), k in zip(columns, once, strict=True)]
+
+    def _decoded(self, grey: UInt8, xy: Float, score: Float, log_id: Float) -> Detections:
         if not self.verified or not len(xy) or min(grey.shape) < 2 * CELL:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify.examine(grey, xy, score, log_id, self.patches)
-        score = verify.score(found)
-        sure = np.flatnonzero(score >= self.threshold)
+        sure = np.flatnonzero(found.score >= self.threshold)
+        xy, score, apart = found.xy[sure], found.score[sure], 0.6 * found.minor_px[sure]
         # discs do not overlap: of two centres within one disc the likelier stays
-        kept = sure[suppress(found.xy[sure], score[sure], np.maximum(how.separation_px, 0.6 * found.minor_px[sure]))]
-        return Detections(found.xy[kept], score[kept], self._patch_ids[found.which[kept]])
+        kept = suppress(xy, score, np.maximum(Decoding.separation_px, apart))
+        return Detections(xy[kept], score[kept], self._patch_ids[found.which[sure[kept]]])
 
 
 @dataclass
