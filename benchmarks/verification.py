@@ -158,19 +158,20 @@ def trained(
 ) -> Judge:
     """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate."""
     torch.manual_seed(0)
-    right = np.concatenate([explains(f.xy, _ids(f), t, tolerance) for f, t in zip(found, truths, strict=True)])
-    view, evidence = (torch.cat(parts) for parts in zip(*(_tensors(f) for f in found if len(f.place)), strict=True))
-    target = torch.from_numpy(right).float()
-    judge = Judge(evidence.numpy(), width)
+    right = [explains(f.xy, _ids(f), t, tolerance) for f, t in zip(found, truths, strict=True)]
+    known = np.concatenate(right)
     # before the fit nearly all are wrong: some of them, with more weight, stand for all
-    share = min(1.0, 3 * right.mean() / (1 - right).mean())
-    chosen = torch.from_numpy(np.flatnonzero(right | (np.random.default_rng(0).random(len(right)) < share)))
+    share, rng = min(1.0, 3 * known.mean() / (1 - known).mean()), np.random.default_rng(0)
+    kept = [np.flatnonzero(r | (rng.random(len(r)) < share)) for r in right]
+    tensors = [_tensors(f[k]) for f, k in zip(found, kept, strict=True) if len(k)]
+    view, evidence = (torch.cat(parts) for parts in zip(*tensors, strict=True))
+    target = torch.from_numpy(np.concatenate([r[k] for r, k in zip(right, kept, strict=True)])).float()
     weight = torch.where(target > 0, 1.0, 1 / share)
-    view, evidence, target, weight = (column[chosen] for column in (view, evidence, target, weight))
+    judge = Judge(evidence.numpy(), width)
     optimizer = torch.optim.AdamW(judge.parameters(), weight_decay=2e-2)
     steps = epochs * (len(target) // BATCH)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
-    progress = tqdm(total=steps, desc=f"train on {len(target)}, {right.mean():.0%} right", leave=False)
+    progress = tqdm(total=steps, desc=f"train on {len(target)}, {known.mean():.0%} right", leave=False)
     for _ in range(epochs):
         for rows in torch.randperm(len(target)).split(BATCH)[: len(target) // BATCH]:
             logit = judge(_disturbed(view[rows]), evidence[rows])

@@ -30,7 +30,7 @@ MOST_KEYPOINTS = 12
 IMAGE_PX = (640, 480)  # the image that a crop is thought to be cut from: focal lengths are relative to it
 ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
 VIEWS = {1.0: 0.5, 1.5: 0.35, 0.5: 0.15}
-"""Scales at which a crop's image is shown, as the detector looks at all of them, and how often each comes."""
+"""Scales at which a crop's image is shown, and how often each comes."""
 VIEW_RADIUS_PX = (5.0, 40.0)
 """Radii at the scale 1.5, where what is large is left to the other scales; px of the image itself."""
 DETECTABLE = 15.0

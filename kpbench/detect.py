@@ -92,12 +92,13 @@ class LoadedDetector:
         return found
 
 
-def load_detector(name: str) -> LoadedDetector:
+def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
     """A shipped detector by name; yours as weights ``FILE.onnx``, ``MODULE:ATTR``, or ``program:COMMAND``.
 
     A file is one that ``kpbench export-model`` wrote. ``ATTR`` may be a function of an image, an object with a
     method ``detect`` (or that can be called), or a class that gives such an object when called without
-    arguments. Modules in the current folder are found.
+    arguments. Modules in the current folder are found. ``threshold`` takes the place of the detector's own, if it
+    has an attribute of that name.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def load_detector(name: str) -> LoadedDetector:
         many = partial(run_program, name.removeprefix(PROGRAM).strip())
         return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
     if name.endswith(".onnx"):
-        made = _resolve(SUPERPOINT)(Path(name))
+        made = _with(threshold, _resolve(SUPERPOINT)(Path(name)))
         return LoadedDetector(Path(name).stem, made.version, made.detect)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
@@ -117,7 +118,7 @@ def load_detector(name: str) -> LoadedDetector:
         )
     found = _resolve(DETECTORS.get(name, name))
     try:
-        made = found() if isinstance(found, type) else found
+        made = _with(threshold, found() if isinstance(found, type) else found)
     except DataError:
         raise
     except (Exception, SystemExit) as error:
@@ -128,6 +129,12 @@ def load_detector(name: str) -> LoadedDetector:
     version = getattr(made, "version", __version__ if name in DETECTORS else "unknown")
     label = name if name in DETECTORS else str(getattr(made, "name", name))
     return LoadedDetector(label, str(version), run, getattr(made, "board", None))
+
+
+def _with(threshold: float | None, detector: Any) -> Any:
+    if threshold is not None and hasattr(detector, "threshold"):
+        detector.threshold = threshold
+    return detector
 
 
 def _resolve(path: str) -> Any:

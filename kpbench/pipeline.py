@@ -56,7 +56,8 @@ def predict(
     dataset : Dataset
     detector : name or ``MODULE:ATTR`` (see :func:`kpbench.detect.load_detector`), or a loaded one, which
         stays in this process.
-    threshold : drop detections of a lower score; None keeps all.
+    threshold : drop detections of a lower score, in place of the detector's own limit if it is given by name and has
+        one (an attribute ``threshold``); None keeps all.
     workers : processes, for a detector given by name; None for one a core.
     overlay : folder or video to draw the detections into.
     progress : called as images are finished.
@@ -66,7 +67,7 @@ def predict(
     DataError
         If the detector cannot be loaded, or the dataset cannot be read.
     """
-    loaded = load_detector(detector) if isinstance(detector, str) else detector
+    loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):
         workers = 1
     pieces = [range(first, min(first + 32, len(dataset))) for first in range(0, len(dataset), 32)]
@@ -95,7 +96,7 @@ def predict_images(
 
     Parameters and errors are those of :func:`predict`; ``source`` is from :func:`kpbench.sources.open_images`.
     """
-    loaded = load_detector(detector) if isinstance(detector, str) else detector
+    loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[Found](), list[str]()
     with image_writer(overlay, source.fps) as draw, contextlib.suppress(KeyboardInterrupt):
         # a camera never ends: Ctrl-C keeps what was found so far
@@ -148,8 +149,8 @@ def _line_of(error: BaseException) -> str:
 
 
 @cache
-def _loaded(name: str) -> LoadedDetector:
-    return load_detector(name)
+def _loaded(name: str, threshold: float | None) -> LoadedDetector:
+    return load_detector(name, threshold)
 
 
 def detect_some(
@@ -159,7 +160,7 @@ def detect_some(
 
     Parameters are those of :func:`predict`; ``piece`` holds the positions of the images.
     """
-    loaded = _loaded(detector) if isinstance(detector, str) else detector
+    loaded = _loaded(detector, threshold) if isinstance(detector, str) else detector
     if loaded.run_many is not None:
         with contextlib.suppress(Exception):  # if it fails, one by one tells on which images
             together = loaded.detect_many([dataset.image(n) for n in piece])

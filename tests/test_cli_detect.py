@@ -25,6 +25,13 @@ def moody(image):
     if int(image.sum()) % 2:
         raise RuntimeError("not today")
     return brightest(image)
+
+class Unsure:
+    threshold = 0.5
+
+    def detect(self, image):
+        found = brightest(image)
+        return found[found.score >= self.threshold]
 """
 
 
@@ -82,6 +89,12 @@ def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
         "sub/1.png",
         "sub/2.png",
     ]
+
+
+def test_a_threshold_takes_the_place_of_the_detectors_own(folder, plug):
+    photos(folder, 1)
+    for threshold, count in ([], 1), (["--threshold", 0.1], 2), (["--threshold", 1.1], 0):
+        assert f"{count} detections" in run("photos", "--detector", f"{plug}:Unsure", *threshold).stdout
 
 
 def test_one_image_is_drawn_into_one_file_and_more_into_a_folder(folder, plug):

@@ -54,12 +54,22 @@ def how_to_score(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--gt",
             type=click.Path(path_type=Path),
-            help="Dataset, or COCO annotations (.json); else the one that PREDS names, else ./kpbench-data.",
+            help="Dataset, or COCO annotations (.json); else the one that the predictions name, else ./kpbench-data.",
         ),
         click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii."),
-        click.option("--eps-radius", type=click.Choice(["major", "minor", "mean"]), default="major", show_default=True),
         click.option(
-            "--matching", type=click.Choice(["one-to-one", "literal"]), default="one-to-one", show_default=True
+            "--eps-radius",
+            type=click.Choice(["major", "minor", "mean"]),
+            default="major",
+            show_default=True,
+            help="Which semi-axis of a tilted disc --eps is a share of.",
+        ),
+        click.option(
+            "--matching",
+            type=click.Choice(["one-to-one", "literal"]),
+            default="one-to-one",
+            show_default=True,
+            help="literal: the paper's formulas as printed, where several detections of a keypoint all count.",
         ),
         click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections."),
         click.option(

@@ -82,8 +82,10 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
 
     \b
     Effects and their rungs in the suites:
-      blur 3 7 11 15 px · dimming 10 20 30 40 · noise 15 30 45 60 grey levels · gaussian-blur · motion-blur
-      defocus · shadow-edge · rain · jpeg · low-light · occlusion · flare
+      blur 3 7 11 15 px · dimming 10 20 30 40 · noise 15 30 45 60 grey levels · motion-blur 5 10 20 30 px
+      defocus 2 4 6 9 px · shadow-edge 30 50 70 90 % · rain 500 1000 2000 4000 · jpeg 50 25 10 5
+      low-light 4 6 8 9 stops · occlusion 10 20 30 40 % · flare 60 120 180 240
+      gaussian-blur and dimming-literal are in none
 
     \b
     Examples:
