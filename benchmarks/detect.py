@@ -2,10 +2,11 @@
 
     python benchmarks/detect.py DATASET [--images 20] [--superpoint FILE.onnx]
 
-For each detector: the network alone, what follows it (decoding, and verification by the designs), and both, for one
-image at a time, medians over the images; then images a second. The rival is SuperPoint's network of the paper's
-size (64-64-128-128, 256) with random weights in PyTorch, the network alone: its decoding is not counted.
-Runs are interleaved, so that a machine that slows down slows all. `--superpoint` times a full-size model too.
+For each detector, one image at a time, medians over the images: the network at all scales that it looks at; the whole
+step, with decoding and verification by the designs; and the step without verification, at one scale. The rival is
+SuperPoint's network of the paper's size (64-64-128-128, 256) with random weights in PyTorch, the network alone: its
+decoding is not counted. Runs are interleaved, so that a machine that slows down slows all. `--superpoint` times a
+full-size model too.
 """
 
 from __future__ import annotations
@@ -13,12 +14,15 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 
 import kpbench
+from kpbench.detect import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
+from kpbench.geometry import resize
 from kpbench.network import SuperPoint
 from kpbench.recipe import NetworkConfig
 
@@ -30,16 +34,20 @@ def main() -> None:
     parser.add_argument("--superpoint")
     options = parser.parse_args()
     dataset = kpbench.open_dataset(options.dataset)
-    images = [dataset.image(n) for n in range(min(options.images, len(dataset)))]
-    detectors = {"superpoint-small": SmallSuperPointDetector()}
+    images = [to_grey(dataset.image(n)) for n in range(min(options.images, len(dataset)))]
+    detectors: dict[str, tuple[SuperPointDetector, SuperPointDetector]] = {
+        "superpoint-small": (SmallSuperPointDetector(), SmallSuperPointDetector(verified=False))
+    }
     if options.superpoint:
-        detectors["superpoint"] = SuperPointDetector(options.superpoint)
+        path = Path(options.superpoint)
+        detectors["superpoint"] = SuperPointDetector(path), SuperPointDetector(path, verified=False)
     torch.set_num_threads(kpbench.workers.cores())
     rival = SuperPoint(NetworkConfig()).eval()
     steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}
-    for name, detector in detectors.items():
-        steps[f"{name}: network"] = lambda image, d=detector: d.heads([image])
+    for name, (detector, alone) in detectors.items():
+        steps[f"{name}: network"] = lambda image, d=detector: [d.heads([view]) for view in _views(image, d.scales)]
         steps[f"{name}: whole"] = detector
+        steps[f"{name}: not verified"] = alone
     seconds: dict[str, list[float]] = {name: [] for name in steps}
     for step in steps.values():
         step(images[0])
@@ -53,17 +61,21 @@ def main() -> None:
     print(f"{width}x{height}, {len(images)} images, medians")
     for name, times in seconds.items():
         median = np.median(times)
-        print(f"{name:28} {1e3 * median:8.1f} ms {1 / median:7.1f} images/s {floor / median:6.1f} x")
+        print(f"{name:32} {1e3 * median:8.1f} ms {1 / median:7.1f} images/s {floor / median:6.1f} x")
     for name in detectors:
         after = np.median(np.subtract(seconds[f"{name}: whole"], seconds[f"{name}: network"]))
         print(f"{name}: after the network {after / np.median(seconds[f'{name}: network']):.0%} of its time")
 
 
+def _views(image: np.ndarray, scales: tuple[float, ...]) -> list[np.ndarray]:
+    height, width = image.shape
+    return [resize(image, round(scale * width), round(scale * height)) for scale in scales]
+
+
 @torch.inference_mode()
 def _torch(network: SuperPoint, image: np.ndarray) -> object:
-    grey = image if image.ndim == 2 else image.mean(axis=2)
-    height, width = (side // 8 * 8 for side in grey.shape)
-    return network(torch.from_numpy(grey[:height, :width].astype(np.float32) / 255)[None, None])
+    height, width = (side // 8 * 8 for side in image.shape)
+    return network(torch.from_numpy(image[:height, :width].astype(np.float32) / 255)[None, None])
 
 
 if __name__ == "__main__":

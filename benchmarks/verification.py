@@ -5,9 +5,9 @@
 The sets must come from photographs that are free for fitting: `kpbench synth --n 1600 --backgrounds training/`.
 Two judges, one before the fit and one after it, of the same small network. Before the fit a hypothesis is right if its
 centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth.
-Prints the detection score of the test set at several rates of false alarms an image, with verification and for the
-network alone, and what pruning before the fit loses. `--write` replaces `posed.onnx` and `fitted.onnx` of
-`kpbench/weights`. Needs `pip install 'kpbench[train]'`.
+Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
+they are, after the first judge, and after the second, which is what the detector reports. `--write` replaces
+`posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import kpbench
 from kpbench import verify
 from kpbench.detect import suppress, to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
-from kpbench.match import VIEW_PX, short_axis
+from kpbench.match import VIEW_PX, Picture, short_axis
 from kpbench.workers import cores, one_thread
 
 RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
@@ -72,11 +72,11 @@ def _convolution(inside: int, outside: int) -> list[nn.Module]:
 
 @dataclass
 class Looked:
-    """What is known of one image: the truth, what the network alone would report, and the hypotheses."""
+    """What is known of one image: the truth, the candidates' scores and whether they are right, the hypotheses."""
 
     keypoints: np.ndarray
-    alone: np.ndarray
-    alone_right: np.ndarray
+    score: np.ndarray
+    right: np.ndarray
     posed: verify.Hypotheses
     fitted: verify.Hypotheses | None = None
 
@@ -98,12 +98,12 @@ def look(path: str, n: int) -> Looked:
     xy, score, log_id = _detector.candidates([grey])[0]
     ids = np.array([patch.patch_id for patch in _detector.patches])[log_id[:, :-1].argmax(axis=1)]
     right = explains(xy, ids, keypoints, 0.1)
-    return Looked(keypoints, score, right, verify.posed(verify.Picture(grey), xy, score, log_id, _detector.patches))
+    return Looked(keypoints, score, right, verify.posed(Picture(grey), xy, score, log_id, _detector.patches))
 
 
 def fit(path: str, n: int, posed: verify.Hypotheses) -> verify.Hypotheses:
     """Hypotheses of one image, fitted."""
-    picture = verify.Picture(to_grey(kpbench.open_dataset(path).image(n)))
+    picture = Picture(to_grey(kpbench.open_dataset(path).image(n)))
     return verify.fitted(picture, posed, _detector.patches)
 
 
@@ -203,18 +203,9 @@ def _disturbed(view: torch.Tensor) -> torch.Tensor:
 
 
 @torch.inference_mode()
-def logits(judge: Judge, found: verify.Hypotheses) -> np.ndarray:
-    """What a judge says of hypotheses (n,)."""
-    return judge(*_tensors(found)).numpy().astype(np.float64) if len(found.place) else np.zeros(0)
-
-
 def probability(judge: Judge, found: verify.Hypotheses) -> np.ndarray:
-    """The same as probabilities."""
-    return 1 / (1 + np.exp(-logits(judge, found)))
-
-
-def _logit(probability: float) -> float:
-    return float(np.log(probability / (1 - probability)))
+    """What a judge says of hypotheses (n,)."""
+    return torch.sigmoid(judge(*_tensors(found)).double()).numpy() if len(found) else np.zeros(0)
 
 
 def report(test: list[Looked], before: Judge, after: Judge) -> None:
@@ -222,7 +213,7 @@ def report(test: list[Looked], before: Judge, after: Judge) -> None:
     truths, images = sum(len(one.keypoints) for one in test), len(test)
     print(f"{images} images, {truths} keypoints\nfalse alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
     rows = {
-        "network alone": [(one.alone, one.alone_right) for one in test],
+        "candidates": [(one.score, one.right) for one in test],
         "before the fit": [_judged(before, one.posed, one.keypoints) for one in test],
         "after the fit": [_judged(after, one.fitted, one.keypoints) for one in test],
     }
@@ -233,10 +224,10 @@ def report(test: list[Looked], before: Judge, after: Judge) -> None:
         line = [found[max(np.searchsorted(alarms, rate, side="right") - 1, 0)] for rate in RATES]
         print(f"{name:27}" + "".join(f"{value:8.3f}" for value in line))
         for limit in (0.3, 0.5):
-            sure = score > _logit(limit)
+            sure = score >= limit
             hits, misses = (right & sure).sum() / truths, (~right & sure).sum() / images
             print(f"    at {limit}: detection {hits:.3f}, alarms {misses:.3f}")
-    fits = sum(len(one.fitted.place) for one in test)
+    fits = sum(len(one.fitted) for one in test)
     print(
         f"fitted: {fits / images:.1f} of {sum(one.posed.place.max(initial=-1) + 1 for one in test) / images:.1f} places"
     )
@@ -252,9 +243,9 @@ def _truths_explained(found: verify.Hypotheses, keypoints: np.ndarray, tolerance
 
 def _judged(judge: Judge, found: verify.Hypotheses, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scores, and whether they are right, of what stays as the detector suppresses it."""
-    logit = logits(judge, found)
-    kept = suppress(found.xy, logit, np.maximum(Decoding.separation_px, 0.6 * short_axis(found.A)))
-    return logit[kept], explains(found.xy, _ids(found), keypoints, 0.1)[kept]
+    score = probability(judge, found)
+    kept = suppress(found.xy, score, np.maximum(Decoding.separation_px, 0.6 * short_axis(found.A)))
+    return score[kept], explains(found.xy, _ids(found), keypoints, 0.1)[kept]
 
 
 def to_onnx(judge: Judge) -> bytes:

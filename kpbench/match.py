@@ -1,12 +1,13 @@
 """Compare places in an image with designs, coarse to fine: pose, and how far the pattern reaches.
 
-Three steps, each over many candidates at once:
+Each step looks at many candidates at once:
 
 * :func:`search` finds the pose where only a rough place and scale are known: it samples the image on
   circles around the place, under a bank of tilts, and correlates with every design in every rotation;
 * :func:`align` moves a pose onto the image (inverse compositional Gauss-Newton, Baker and Matthews,
   *Lucas-Kanade 20 years on*, IJCV 2004);
-* :func:`extend` measures how far the sectors reach, which is the patch's size.
+* :func:`extend` measures how far the sectors reach, which is the patch's size;
+* :func:`view` shows the image in the frame of the patch.
 
 The first two can look at the innermost sectors alone, which are the same at every size.
 Poses are affine: ``x_px = xy + A @ u``.
@@ -30,13 +31,13 @@ from kpbench.keypoints import Float, UInt8
 __all__ = [
     "RING_PX",
     "Bank",
+    "Picture",
     "Poses",
     "Templates",
     "align",
     "bank",
     "extend",
     "likeness",
-    "noise",
     "pyramid",
     "search",
     "short_axis",
@@ -195,10 +196,22 @@ def pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
     return levels
 
 
-def noise(image: Float32) -> float:
-    """Standard deviation of noise from the median of second differences, which edges hardly move."""
-    kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
-    return 1.4826 * float(np.median(np.abs(cv2.filter2D(image, cv2.CV_32F, kernel)[::2, ::2])))
+class Picture:
+    """A grey image and what is needed of it again and again.
+
+    Attributes
+    ----------
+    raw, smooth : its :func:`pyramid`, as it is and smoothed.
+    noise : standard deviation, grey levels, from the median of second differences, which edges hardly move.
+    range : grey levels between its dark and its bright parts.
+    """
+
+    def __init__(self, grey: UInt8) -> None:
+        self.raw, self.smooth = pyramid(grey, 0), pyramid(grey)
+        kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
+        self.noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(self.raw[0], cv2.CV_32F, kernel)[::2, ::2])))
+        dark, bright = np.percentile(grey[::4, ::4], (2, 98))
+        self.range = float(bright - dark)
 
 
 def likeness(core: Float, whole: Float) -> Float:
@@ -276,7 +289,7 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
     Returns
     -------
     Poses
-        One to D a place, in the order of the places (all D where ``margin`` is 2, the range of correlations);
+        One to D a place, in the order of the places (all D where ``margin`` is infinite);
         ``A`` maps the unit circle of ``known.core``.
     """
     scale = RING_PX * 2.0**level
@@ -406,36 +419,56 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
     with the largest sum of votes is the sectors' edge. Two edges leave the stretch along each of them open,
     so ellipses are tried that differ in it; three or more edges leave the size alone.
     """
-    votes = _votes(levels, poses, known)
-    summed = np.cumsum(votes * (RADII * np.gradient(RADII)).astype(np.float32)[:, None], axis=1)
     A = poses.A.copy()
+    for rows in np.split(np.arange(len(poses)), range(BLOCK, len(poses), BLOCK)):
+        # most places are no patch, and end at once
+        A[rows], ended = _reach(levels, poses[rows], known, NEAR)
+        far = rows[~ended]
+        A[far], _ = _reach(levels, poses[far], known, len(RADII))
+    return Poses(poses.xy, A, poses.which, poses.ncc)
+
+
+NEAR = 12
+"""Radii of a first look."""
+BLOCK = 2**11
+"""Poses at once: memory does not grow with the image."""
+
+
+def _reach(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> tuple[Float, NDArray[np.bool_]]:
+    """Maps (N, 2, 2) of the unit disc, looking at so many radii, and whether more of them would change nothing (N,)."""
+    votes = _votes(levels, poses, known, count)
+    summed = votes * (RADII * np.gradient(RADII)).astype(np.float32)[:count, None]
+    for ring in range(1, count):  # np.cumsum takes four times as long
+        summed[:, ring] += summed[:, ring - 1]
+    A, ended = poses.A.copy(), np.zeros(len(poses), bool)
     for d, patch in enumerate(known.patches):
         rows = np.flatnonzero(poses.which == d)
-        shapes, ends = _ellipses(patch)
+        shapes, ends, certain = _ellipses(patch, count)
         # (radii x spokes, rows) of what the votes add up to, those in favour, and all that were cast
-        tables = [t[rows].reshape(len(rows), len(RADII) * SPOKES).T for t in (summed, votes > 0, votes != 0)]
+        tables = [t[rows].reshape(len(rows), count * SPOKES).T for t in (summed, votes > 0, votes != 0)]
         total, yes, cast = (
-            (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), len(RADII)) for t in tables
+            (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), count) for t in tables
         )
         # beyond the first circle that disagrees, what agrees is chance
         alien = np.logical_or.accumulate((yes < AGREE * cast) | (yes < 0.3 * SPOKES), axis=2)
         alien[:, :, 0] = False
-        best = np.where(alien, -np.inf, total).reshape(len(rows), len(shapes) * len(RADII)).argmax(axis=1)
-        shape, size = np.unravel_index(best, (len(shapes), len(RADII)))
+        ended[rows] = alien[:, :, certain].all(axis=1)
+        best = np.where(alien, -np.inf, total).reshape(len(rows), len(shapes) * count).argmax(axis=1)
+        shape, size = np.unravel_index(best, (len(shapes), count))
         A[rows] = A[rows] @ (shapes[shape] * RADII[size][:, None, None]) / patch.cells[0][1]
-    return Poses(poses.xy, A, poses.which, poses.ncc)
+    return A, ended
 
 
-def _votes(levels: Sequence[Float32], poses: Poses, known: Bank) -> Float32:
+def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> Float32:
     """From -1.4 (the other ink) to 0.6 (the predicted ink), 0 outside the image: (N, radii, spokes)."""
-    spokes = _spokes()
+    spokes, radii = _spokes(), RADII[:count]
     ink = np.array([_look_up(_soft_ink(p, False), spokes) for p in known.patches], np.float32)
     predicted = ink[poses.which][:, None]
-    shape = (len(poses), len(RADII), len(spokes))
-    xy = np.repeat(poses.xy, len(RADII), axis=0)
-    A = (poses.A[:, None] * RADII[:, None, None]).reshape(-1, 2, 2)
+    shape = (len(poses), len(radii), len(spokes))
+    xy = np.repeat(poses.xy, len(radii), axis=0)
+    A = (poses.A[:, None] * radii[:, None, None]).reshape(-1, 2, 2)
     grey = _sample(levels, _level(short_axis(A), RING_PX, levels), xy, A, spokes).reshape(shape)
-    core = grey[:, RADII <= 1.0].mean(axis=1)
+    core = grey[:, radii <= 1.0].mean(axis=1)
     light = predicted[:, 0] > 0
     white = (core * light).sum(axis=1) / light.sum(axis=1)
     black = (core * ~light).sum(axis=1) / (~light).sum(axis=1)
@@ -451,16 +484,16 @@ def _votes(levels: Sequence[Float32], poses: Poses, known: Bank) -> Float32:
 
 
 @lru_cache(maxsize=64)
-def _ellipses(patch: Patch) -> tuple[Float, csr_array]:
-    """Shapes (G, 2, 2) that are tried, and the samples where each one ends: (G x radii, radii x spokes), 0 or 1."""
+def _ellipses(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
+    """Shapes (G, 2, 2) to try, samples where each ends (G x radii, radii x spokes), last radius at which all do."""
     shapes = _stretches(patch)
     reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spokes()), axis=2)
     shift = np.rint(np.log(reach) / np.log(RADII[1] / RADII[0])).astype(np.int64)
-    ring = np.clip(np.arange(len(RADII))[:, None] + shift[:, None], 0, len(RADII) - 1)  # (G, radii, spokes)
+    ring = np.clip(np.arange(count)[:, None] + shift[:, None], 0, count - 1)  # (G, radii, spokes)
     column = (ring * SPOKES + np.arange(SPOKES)).ravel()
     row = np.repeat(np.arange(len(column) // SPOKES), SPOKES)
-    ends = csr_array((np.ones(len(column), np.float32), (row, column)), (row[-1] + 1, len(RADII) * SPOKES))
-    return shapes, ends
+    ends = csr_array((np.ones(len(column), np.float32), (row, column)), (row[-1] + 1, count * SPOKES))
+    return shapes, ends, max(count - 1 - int(shift.max()), 0)
 
 
 def _spokes() -> Float:

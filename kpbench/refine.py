@@ -2,8 +2,7 @@
 
 :func:`fit` renders the design with exact coverage under the pose, blurs it, and moves everything that it
 does not know until model and pixels agree (Gauss-Newton with robust weights). What it does not know:
-centre, affine map, perspective, both inks, and the blur. :func:`refine` does that for the detections of any
-detector, finding the pose first with :mod:`kpbench.match`.
+centre, affine map, perspective, both inks, and the blur. :mod:`kpbench.match` finds the pose that it starts from.
 """
 
 from __future__ import annotations
@@ -179,7 +178,7 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     size, half = np.abs(residual), len(residual) // 2
     usual = 2.5 * 1.48 * float(np.partition(size, half)[half]) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(size, 1e-6))
-    return _moved(state, weighted @ moves.T, weighted @ residual, minor)
+    return _moved(state, weighted @ moves.T, weighted @ residual, minor, extent)
 
 
 def _inverse(m: Float) -> tuple[float, float, float, float]:
@@ -196,7 +195,7 @@ def _short_axis(m: Float) -> float:
     return float(np.sqrt(max(square - np.sqrt(max(square**2 - 4 * det**2, 0.0)), 1e-12) / 2))
 
 
-def _moved(state: _State, normal: Float, target: Float, minor: float) -> _State:
+def _moved(state: _State, normal: Float, target: Float, minor: float, extent: float) -> _State:
     """Solve the normal equations of (white, ink, x, y, 4 of A, 2 of bend, blur²) and take the step, within reason."""
     damped = np.arange(4, 11)  # sectors alone leave size and some stretches open
     normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
@@ -210,6 +209,7 @@ def _moved(state: _State, normal: Float, target: Float, minor: float) -> _State:
     grow = grow * min(1.0, 0.2 * minor / max(float(np.abs(grow).max()), 1e-9))
     blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[10], -1, 1), 0.04, (0.5 * minor) ** 2)))
     bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
+    bend *= min(1.0, 0.56 / (BEYOND * extent * max(float(np.hypot(*bend)), 1e-9)))  # the model stays before the camera
     return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur)
 
 

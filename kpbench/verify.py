@@ -10,18 +10,21 @@ photographs.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import match, refine
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
+from kpbench.match import Picture
 from kpbench.runtime import Session, open_session
 
 __all__ = [
@@ -29,12 +32,12 @@ __all__ = [
     "POSED",
     "Examined",
     "Hypotheses",
-    "Picture",
     "examine",
     "fitted",
     "inputs",
     "judged",
     "posed",
+    "version",
     "worth_a_fit",
 ]
 
@@ -79,20 +82,6 @@ LEAST_FIT = 0.7
 """Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
 
 
-class Picture:
-    """A grey image and what is needed of it again and again."""
-
-    def __init__(self, grey: UInt8) -> None:
-        self.raw, self.smooth = match.pyramid(grey, 0), match.pyramid(grey)
-        self.noise = match.noise(self.raw[0])
-        dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-        self.range = float(bright - dark)
-
-    def contrasts(self, contrast: Float) -> list[Float]:
-        """Logs of contrasts (n,), grey levels, over the range of the image and over its noise."""
-        return [np.log(contrast / (self.range + 5)), np.log(contrast / (self.noise + 1))]
-
-
 @dataclass(frozen=True)
 class Hypotheses:
     """n places, each with the design and the pose that it is taken for.
@@ -114,6 +103,9 @@ class Hypotheses:
     A: Float
     view: NDArray[np.float32]
     evidence: Float
+
+    def __len__(self) -> int:
+        return len(self.place)
 
     def __getitem__(self, keep: Any) -> Hypotheses:
         return Hypotheses(*(column[keep] for column in vars(self).values()))
@@ -139,8 +131,10 @@ class Examined:
     score: Float
 
 
-def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Examined:
-    """Compare places with all designs, and fit what looks like one.
+def examine(
+    grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
+) -> Examined:
+    """Compare places with the designs that the network holds likely, and fit what looks like one.
 
     Parameters
     ----------
@@ -149,33 +143,33 @@ def examine(grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches
     network_score : ndarray of shape (n,), in [0, 1]
     log_id : ndarray of shape (n, len(patches) + 1): log-probability of each design, and of none.
     patches : the designs.
+    threads : of the judges; 0 means as many as OpenCV may use.
     """
     picture = Picture(grey)
     before = posed(picture, xy, network_score, log_id, patches)
-    found = fitted(picture, before[worth_a_fit(before, judged("posed", before, patches))], patches)
+    found = fitted(picture, before[worth_a_fit(before, judged("posed", before, patches, threads))], patches)
     minor = _minor(found.A)
     correlation = 1.01 - np.exp(-found.evidence[:, len(POSED)])
     near = np.linalg.norm(found.xy - found.at, axis=1) <= np.maximum(3.0, 0.35 * minor)
     centres = np.where(((correlation >= LEAST_FIT) & near)[:, None], found.xy, found.at)
-    return Examined(found.place, found.which, centres, minor, judged("fitted", found, patches))
+    return Examined(found.place, found.which, centres, minor, judged("fitted", found, patches, threads))
 
 
 def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Hypotheses:
-    """Up to three designs and poses for every place, as good as any (parameters as for :func:`examine`).
+    """The likeliest designs and poses of every place, at most TRIED (parameters as for :func:`examine`).
 
     The circles of an octave that is not the patch's show the background, which can look like any core. So every
     octave's pose is laid over the whole disc before some are chosen, and moving far from the place counts against it.
     """
     known, levels = match.bank(patches), picture.smooth
-    octaves, designs = min(OCTAVES, len(levels)), len(patches)
+    octaves = min(OCTAVES, len(levels))
     level = np.repeat(np.arange(octaves), len(xy))
-    cores = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=2.0)  # all designs at each
-    place, which = np.nonzero(log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT)
-    tried = (np.arange(octaves)[:, None] * len(xy) * designs + place * designs + which).ravel()
-    cores = match.align(levels, cores[tried], known.core, 3, 0.9 * match.RING_PX)
+    likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
+    cores = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=np.inf)
+    cores = match.align(levels, cores[np.tile(likely.ravel(), octaves)], known.core, 3, 0.9 * match.RING_PX)
     whole = match.align(levels, match.extend(levels, cores, known), known.whole, 4, 5.6)
 
-    place = np.tile(place, octaves)
+    place = np.tile(np.nonzero(likely)[0], octaves)
     moved = np.linalg.norm(whole.xy - xy[place], axis=1)
     likeness = match.likeness(cores.ncc, whole.ncc) - FARNESS * np.log(moved + 0.5)
     value = log_id[place, whole.which] + LIKENESS_IN_ID * likeness
@@ -194,7 +188,7 @@ def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patc
             -np.log(1.01 - cores.ncc[best]),
             -np.log(1.01 - poses.ncc),
             np.log(moved[best] / minor + 0.02),
-            *picture.contrasts(contrast),
+            *_contrasts(contrast, picture),
             np.log(minor),
         ]
     )
@@ -222,20 +216,20 @@ def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hy
             np.log(unexplained + 0.02),
             np.minimum(fit.blur_px / minor, 1.0),
             np.log(moved / minor + 0.02),
-            *picture.contrasts(contrast),
+            *_contrasts(contrast, picture),
             np.log(minor),
         ]
     )
     view, _ = match.view(picture.smooth, fit.xy, fit.A, before.which, match.bank(patches))
-    evidence = np.column_stack([before.evidence, np.nan_to_num(measured)])
+    evidence = np.column_stack([before.evidence, measured])
     return Hypotheses(before.place, before.at, before.which, fit.xy, fit.A, view, evidence)
 
 
-def judged(stage: str, found: Hypotheses, patches: Sequence[Patch]) -> Float:
+def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> Float:
     """Probability (n,) that there is a patch, and that its centre and design are right, after a stage."""
-    if not len(found.place):
+    if not len(found):
         return np.zeros(0)
-    logit = _judge(stage).run(None, inputs(found, patches))[0]
+    logit = _judge(stage, threads or cv2.getNumThreads()).run(None, inputs(found, patches))[0]
     return np.asarray(1 / (1 + np.exp(-np.clip(logit, -30, 30))), np.float64)
 
 
@@ -246,9 +240,23 @@ def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.
     return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
 
 
+def version() -> str:
+    """Which judges these are: the first digits of the SHA-256 of their weights."""
+    return hashlib.sha256(_weights("posed") + _weights("fitted")).hexdigest()[:8]
+
+
+def _weights(stage: str) -> bytes:
+    return (Path(__file__).parent / "weights" / f"{stage}.onnx").read_bytes()
+
+
 @cache
-def _judge(stage: str) -> Session:
-    return open_session((Path(__file__).parent / "weights" / f"{stage}.onnx").read_bytes(), 1)[0]
+def _judge(stage: str, threads: int) -> Session:
+    return open_session(_weights(stage), threads)[0]
+
+
+def _contrasts(contrast: Float, picture: Picture) -> list[Float]:
+    """Logs of contrasts (n,), grey levels, over the range of the image and over its noise."""
+    return [np.log(contrast / (picture.range + 5)), np.log(contrast / (picture.noise + 1))]
 
 
 def _minor(A: Float) -> Float:

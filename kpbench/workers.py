@@ -72,9 +72,9 @@ def run_pieces(
             for future in futures:
                 future.cancel()
     elif workers <= 1:
-        one_thread()
-        for piece in pieces:
-            yield work(piece, progress)
+        with _in_one_thread():
+            for piece in pieces:
+                yield work(piece, progress)
     else:
         yield from _in_processes(work, pieces, workers, progress)
 
@@ -145,6 +145,17 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
+@contextmanager
+def _in_one_thread() -> Iterator[None]:
+    threads = cv2.getNumThreads()
+    with threadpool_limits(1):
+        cv2.setNumThreads(1)
+        try:
+            yield
+        finally:
+            cv2.setNumThreads(threads)
+
+
 _counter: Any = None
 
 
@@ -176,11 +187,11 @@ def _in_worker(work: Callable[[Piece, Progress], Result], piece: Piece) -> Resul
 
 def _alone(work: Callable[[Piece, Progress], Result], piece: Piece) -> tuple[Result, int]:
     """A piece's result and its number of images, where no counter is shared."""
-    one_thread()
     images = 0
 
     def count(more: int) -> None:
         nonlocal images
         images += more
 
-    return work(piece, count), images
+    with _in_one_thread():
+        return work(piece, count), images

@@ -7,6 +7,7 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.design import load_patches
+from kpbench.detect import load_detector
 from kpbench.generation import generate
 from kpbench.predictions import read_predictions
 from kpbench.scene import Limits
@@ -95,6 +96,11 @@ def test_a_threshold_takes_the_place_of_the_detectors_own(folder, plug):
     photos(folder, 1)
     for threshold, count in ([], 1), (["--threshold", 0.1], 2), (["--threshold", 1.1], 0):
         assert f"{count} detections" in run("photos", "--detector", f"{plug}:Unsure", *threshold).stdout
+
+
+@pytest.mark.parametrize("name", ["template", "superpoint-small"])
+def test_the_shipped_detectors_have_a_threshold(name):
+    assert load_detector(name, 0.9).run.__self__.threshold == 0.9
 
 
 def test_one_image_is_drawn_into_one_file_and_more_into_a_folder(folder, plug):

@@ -237,3 +237,13 @@ def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
         generate(config(photos), url, workers=1)
     with pytest.raises(DataError, match=r"nosuch:.* cannot be reached"):
         generate(config(photos), "nosuch://bucket/set", workers=1)
+
+
+def test_work_in_this_process_leaves_its_threads_as_they_were(tmp_path):
+    before = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(2)
+        generate(SynthConfig(1, size_px=(64, 48)), tmp_path / "set", workers=1)
+        assert cv2.getNumThreads() == 2
+    finally:
+        cv2.setNumThreads(before)

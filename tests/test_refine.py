@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kpbench import degrade, match, refine
+from kpbench.background import procedural
 from kpbench.design import shipped_patches
 from kpbench.scene import Placement, render_scene
 
@@ -78,6 +81,14 @@ def test_a_patch_at_the_border_is_fitted_on_what_is_there():
     xy, A = np.array([3.3, 40.2]), 20.0 * turn(15)
     fit = fit_one(picture(PATCHES[0], A, xy), xy + np.array([0.3, 0.3]), A, PATCHES[0])
     assert np.hypot(*(fit.xy[0] - xy)) < 0.03
+
+
+def test_a_wide_surround_on_any_texture_keeps_the_model_before_the_camera():
+    rng, wide = np.random.default_rng(0), replace(PATCHES[0], rim=0.5, quiet_zone=1.5)
+    levels = match.pyramid(procedural(rng, 120, 90), 0)
+    xy, A = rng.uniform(20, 70, (60, 2)), rng.uniform(-1, 1, (60, 2, 2)) * 12
+    fit = refine.fit(levels, xy, A, [wide] * 60)
+    assert np.isfinite(fit.xy).all()
 
 
 def test_where_there_is_no_patch_nothing_breaks():

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from kpbench.design import shipped_patches
+from kpbench.design import parse_patch, shipped_patches
 from kpbench.detect import load_detector
 from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells
 from kpbench.errors import DataError
@@ -85,7 +85,7 @@ def test_padding_repeats_the_border_and_keeps_the_origin(height, width):
     assert np.all(padded[height:, :width] == grey[-1])
 
 
-def brightest_pixel_model(schema="kpbench.superpoint/1"):
+def brightest_pixel_model(schema="kpbench.superpoint/1", patches=PATCHES):
     """A graph without training: each pixel's logit is its brightness, "no keypoint" is constant."""
     nodes = [
         helper.make_node("SpaceToDepth", ["image"], ["cells"], blocksize=8),
@@ -119,7 +119,7 @@ def brightest_pixel_model(schema="kpbench.superpoint/1"):
         "name": "brightest",
         "designs": "0" * 64,
         "samples": 0,
-        "patches": [PATCHES[0].to_dict() | {"id": 5}, PATCHES[1].to_dict() | {"id": 7}],
+        "patches": [patches[0].to_dict() | {"id": 5}, patches[1].to_dict() | {"id": 7}],
     }
     helper.set_model_props(model, {"kpbench": json.dumps(content)})
     onnx.checker.check_model(model)
@@ -157,6 +157,24 @@ def test_with_verification_a_bright_pixel_is_no_patch(detector):
     assert len(detector(image)) == 0
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (3, 9), (12, 12), (15, 200)])
+def test_a_tiny_image_is_verified_as_any_other(detector, shape):
+    image = np.zeros(shape, np.uint8)
+    image[0, 0] = 255
+    detector.verified = True
+    assert len(detector(image)) == 0
+
+
+def test_a_design_without_an_edge_at_its_centre_is_left_to_the_network(tmp_path):
+    halves = [{"radius": 0.5, "start_deg": start, "ink": "black"} for start in (0, 180)]
+    bullseye = parse_patch({"name": "eye", "id": 9, "semicircles": halves}, "eye.toml")
+    path = tmp_path / "eye.onnx"
+    path.write_bytes(brightest_pixel_model(patches=(PATCHES[0], bullseye)))
+    image = np.zeros((40, 48), np.uint8)
+    image[5, 13] = 255
+    assert SuperPointDetector(path)(image).patch_id.tolist() == [7]
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [
@@ -178,7 +196,7 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 def test_the_shipped_weights_find_large_clean_patches():
-    """First weights, little trained: an easy scene, so that a wrong file, frame or channel order is seen."""
+    """An easy scene, in which a wrong file, frame or channel order is seen."""
     from kpbench.scene import Limits
     from kpbench.synth import SynthConfig
 

@@ -112,7 +112,7 @@ def test_the_threshold_only_drops_the_worse(rendered):
     assert {tuple(p) for p in some.xy} <= {tuple(p) for p in every.xy}
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (2, 40), (17, 16), (64, 64, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (0, 40), (2, 40), (17, 16), (64, 64, 3)])
 def test_an_image_with_nothing_in_it_has_no_detections(detector, shape):
     found = detector(np.full(shape, 90, np.uint8))
     assert len(found) == 0

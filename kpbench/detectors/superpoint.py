@@ -157,7 +157,7 @@ class SuperPointDetector:
     verified : bool
         Whether the network's candidates are compared with the designs, which the file holds
         (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides, at
-        the image's own scale.
+        the image's own scale; so it is also for designs without an edge at the centre, whose pose shows nowhere.
     threads : int
         Threads of the network's runtime; 0 means as many as OpenCV may use.
     scales : tuple of float
@@ -190,6 +190,9 @@ class SuperPointDetector:
         self.content: dict[str, Any] = content
         self.name, self.version = str(content["name"]), f"{content['designs'][:8]}-{content['samples']}"
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
+        self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
+        if self.verified:
+            self.version += f"-{verify.version()}"
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     def __call__(self, image: UInt8) -> Detections:
@@ -242,9 +245,9 @@ class SuperPointDetector:
         return [(xy[k], score[k], log_id[k]) for (xy, score, log_id), k in zip(columns, once, strict=True)]
 
     def _decoded(self, grey: UInt8, xy: Float, score: Float, log_id: Float) -> Detections:
-        if not self.verified or not len(xy) or min(grey.shape) < 2 * CELL:
+        if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
-        found = verify.examine(grey, xy, score, log_id, self.patches)
+        found = verify.examine(grey, xy, score, log_id, self.patches, self.threads)
         sure = np.flatnonzero(found.score >= self.threshold)
         xy, score, apart = found.xy[sure], found.score[sure], 0.6 * found.minor_px[sure]
         # discs do not overlap: of two centres within one disc the likelier stays

@@ -119,7 +119,7 @@ class Candidates:
         return np.where(sane, 1 / (1 + np.exp(-np.clip(evidence, -30, 30))), 0.0)
 
 
-@dataclass(frozen=True)
+@dataclass
 class TemplateDetector:
     """Finds patches by comparing the image with their designs; call it with an image.
 
@@ -148,7 +148,10 @@ class TemplateDetector:
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
-        found = self.candidates(to_grey(image))
+        grey = to_grey(image)
+        if not grey.size:
+            return Detections.none()
+        found = self.candidates(grey)
         score = found.score
         order = np.argsort(-score, kind="stable")
         order = order[score[order] >= self.threshold]
@@ -161,7 +164,8 @@ class TemplateDetector:
     def candidates(self, grey: UInt8) -> Candidates:
         """Everything in a grey image that is enough like a design to be fitted."""
         known = match.bank(self.patches)
-        raw, smooth = match.pyramid(grey, 0), match.pyramid(grey)
+        picture = match.Picture(grey)
+        raw, smooth = picture.raw, picture.smooth
         poses = match.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
         poses = poses[poses.ncc > 0.62]
         for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
@@ -173,8 +177,7 @@ class TemplateDetector:
         sure = match.likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
-        dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-        return Candidates(whole.which, core.ncc, whole.ncc, fit, match.noise(raw[0]), float(bright - dark))
+        return Candidates(whole.which, core.ncc, whole.ncc, fit, picture.noise, picture.range)
 
 
 def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
