@@ -243,7 +243,7 @@ def test_work_in_this_process_leaves_its_threads_as_they_were(tmp_path):
     before = cv2.getNumThreads()
     try:
         cv2.setNumThreads(2)
-        generate(SynthConfig(1, size_px=(64, 48)), tmp_path / "set", workers=1)
+        generate(SynthConfig(1, size_px=(64, 64)), tmp_path / "set", workers=1)
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
