@@ -6,7 +6,7 @@ The sets must come from photographs that are free for fitting: `kpbench synth --
 Two judges, one before the fit and one after it, of the same small network. Before the fit a hypothesis is right if its
 centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
-they are, after the first judge, and after the second, which is what the detector reports. `--write` replaces
+they are, by each judge, and by the mean of both, which is what the detector reports. `--write` replaces
 `posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
 """
 
@@ -78,6 +78,8 @@ class Looked:
     score: np.ndarray
     right: np.ndarray
     posed: verify.Hypotheses
+    odds: np.ndarray | None = None
+    """By the first judge."""
     fitted: verify.Hypotheses | None = None
 
 
@@ -136,12 +138,14 @@ def main() -> None:
         training = [one for part in sets[:-1] for one in part]
         before = trained([one.posed for one in training], [one.keypoints for one in training], 0.2, 8, options.epochs)
         for path, part in zip(paths, sets, strict=True):
-            hopeful = [one.posed[verify.worth_a_fit(one.posed, probability(before, one.posed))] for one in part]
+            for one in part:
+                one.odds = odds(before, one.posed)
+            hopeful = [one.posed[one.odds >= verify.HOPELESS] for one in part]
             found = pool.map(partial(fit, path), range(len(part)), hopeful)
             for one, after in zip(part, tqdm(found, f"fit {path}", len(part), leave=False), strict=True):
                 one.fitted = after
     after = trained([one.fitted for one in training], [one.keypoints for one in training], 0.1, 16, options.epochs)
-    report(sets[-1], before, after)
+    report(sets[-1], after)
     if options.write:
         for name, judge in (("posed", before), ("fitted", after)):
             target = Path(verify.__file__).parent / "weights" / f"{name}.onnx"
@@ -174,7 +178,7 @@ def trained(
     progress = tqdm(total=steps, desc=f"train on {len(target)}, {known.mean():.0%} right", leave=False)
     for _ in range(epochs):
         for rows in torch.randperm(len(target)).split(BATCH)[: len(target) // BATCH]:
-            logit = judge(_disturbed(view[rows]), evidence[rows])
+            logit = judge(_turned(_disturbed(view[rows])), evidence[rows])
             loss = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
             optimizer.zero_grad()
             loss.backward()
@@ -202,20 +206,29 @@ def _disturbed(view: torch.Tensor) -> torch.Tensor:
     return torch.cat([image, view[:, 1:]], dim=1)
 
 
+def _turned(view: torch.Tensor) -> torch.Tensor:
+    """Image and design together in one of the eight positions of a square: they match as well as before."""
+    view = torch.rot90(view, int(torch.randint(4, ())), (2, 3))
+    return view.flip(3) if torch.rand(()) < 0.5 else view
+
+
 @torch.inference_mode()
-def probability(judge: Judge, found: verify.Hypotheses) -> np.ndarray:
-    """What a judge says of hypotheses (n,)."""
-    return torch.sigmoid(judge(*_tensors(found)).double()).numpy() if len(found) else np.zeros(0)
+def odds(judge: Judge, found: verify.Hypotheses) -> np.ndarray:
+    """Log odds of hypotheses (n,)."""
+    return judge(*_tensors(found)).double().numpy() if len(found) else np.zeros(0)
 
 
-def report(test: list[Looked], before: Judge, after: Judge) -> None:
+def report(test: list[Looked], after: Judge) -> None:
     """Detection score at several rates of false alarms."""
     truths, images = sum(len(one.keypoints) for one in test), len(test)
     print(f"{images} images, {truths} keypoints\nfalse alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
+    last = [odds(after, one.fitted) for one in test]
+    both = [(one.odds[one.odds >= verify.HOPELESS] + then) / 2 for one, then in zip(test, last, strict=True)]
     rows = {
-        "candidates": [(one.score, one.right) for one in test],
-        "before the fit": [_judged(before, one.posed, one.keypoints) for one in test],
-        "after the fit": [_judged(after, one.fitted, one.keypoints) for one in test],
+        "candidates": [(np.log(one.score / (1.0001 - one.score)), one.right) for one in test],
+        "first judge": [_reported(one.odds, one.posed, one.keypoints) for one in test],
+        "second judge": [_reported(then, one.fitted, one.keypoints) for then, one in zip(last, test, strict=True)],
+        "both": [_reported(mean, one.fitted, one.keypoints) for mean, one in zip(both, test, strict=True)],
     }
     for name, pairs in rows.items():
         score, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -224,7 +237,7 @@ def report(test: list[Looked], before: Judge, after: Judge) -> None:
         line = [found[max(np.searchsorted(alarms, rate, side="right") - 1, 0)] for rate in RATES]
         print(f"{name:27}" + "".join(f"{value:8.3f}" for value in line))
         for limit in (0.3, 0.5):
-            sure = score >= limit
+            sure = score >= np.log(limit / (1 - limit))
             hits, misses = (right & sure).sum() / truths, (~right & sure).sum() / images
             print(f"    at {limit}: detection {hits:.3f}, alarms {misses:.3f}")
     fits = sum(len(one.fitted) for one in test)
@@ -241,11 +254,12 @@ def _truths_explained(found: verify.Hypotheses, keypoints: np.ndarray, tolerance
     return sum(explains(found.xy, ids, keypoints[k : k + 1], tolerance).any() for k in range(len(keypoints)))
 
 
-def _judged(judge: Judge, found: verify.Hypotheses, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Scores, and whether they are right, of what stays as the detector suppresses it."""
-    score = probability(judge, found)
-    kept = suppress(found.xy, score, np.maximum(Decoding.separation_px, 0.6 * short_axis(found.A)))
-    return score[kept], explains(found.xy, _ids(found), keypoints, 0.1)[kept]
+def _reported(odds: np.ndarray, found: verify.Hypotheses, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log odds, and whether they are right, of what stays: the likeliest of a place, as the detector suppresses it."""
+    best = verify.likeliest(found.place, odds)
+    found, odds = found[best], odds[best]
+    kept = suppress(found.xy, odds, np.maximum(Decoding.separation_px, 0.6 * short_axis(found.A)))
+    return odds[kept], explains(found.xy, _ids(found), keypoints, 0.1)[kept]
 
 
 def to_onnx(judge: Judge) -> bytes:

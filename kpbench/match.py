@@ -390,7 +390,7 @@ def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     Returns
     -------
     (N, VIEW_PX²) ink, white 1 and black -1 by the least-squares line over the disc, clipped to ±2.5; (N,) half of the
-    contrast, grey levels, at least 2.
+    contrast, grey levels, at least 2, also where the inks are the other way round.
     """
     points = _view_points()
     px = short_axis(A) * 2 * LOOKUP_HALF / VIEW_PX

@@ -3,9 +3,9 @@
 A network says where it sees a keypoint and which design it takes it for. Here the likely designs are laid over
 each such place (:func:`posed`, with :mod:`kpbench.match`), what still looks like a patch is fitted to the pixels
 (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a small network judges: it sees the place in
-the frame of the patch, beside the design, and what was measured. Its answer is the probability that there is a
-patch of this design at this place. ``benchmarks/verification.py`` trains the judges on synthetic images of training
-photographs.
+the frame of the patch, beside the design, and what was measured. Its answer are the log odds that there is a
+patch of this design at this place; the mean of both answers counts. ``benchmarks/verification.py`` trains the judges on
+synthetic images of training photographs.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ __all__ = [
     "fitted",
     "inputs",
     "judged",
+    "likeliest",
     "posed",
     "version",
-    "worth_a_fit",
 ]
 
 POSED = (
@@ -74,12 +74,10 @@ LIKENESS_IN_ID, FARNESS = 0.3, 2.0
 chosen, and what a unit of log distance from the network's place, px, weighs against a unit of likeness."""
 TRIED = 3
 """Hypotheses a place that are judged before the fit."""
-HOPELESS = 0.003
-"""Probability before the fit under which a place is not worth one."""
+HOPELESS = -3.0
+"""Log odds before the fit under which a hypothesis is not worth one."""
 FAINTEST = 2.0
-"""Grey levels between the inks under which nothing that is fitted means anything."""
-LEAST_FIT = 0.7
-"""Correlation of design and pixels from which a fitted centre is trusted more than the network's."""
+"""Grey levels: less than twice this between the inks is no patch; a fitted contrast counts as at least this."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +115,12 @@ class Examined:
 
     Attributes
     ----------
-    place : (n,) index of the place that was asked about.
     which : (n,) index of the likeliest design.
-    xy : (n, 2) px, the fitted centre, or the place itself where the fit is not to be trusted.
+    xy : (n, 2) px, the fitted centre.
     minor_px : (n,) short semi-axis of the fitted disc.
     score : (n,) probability that there is a patch, and that its centre and design are right.
     """
 
-    place: NDArray[np.int64]
     which: NDArray[np.int64]
     xy: Float
     minor_px: Float
@@ -147,12 +143,12 @@ def examine(
     """
     picture = Picture(grey)
     before = posed(picture, xy, network_score, log_id, patches)
-    found = fitted(picture, before[worth_a_fit(before, judged("posed", before, patches, threads))], patches)
-    minor = _minor(found.A)
-    correlation = 1.01 - np.exp(-found.evidence[:, len(POSED)])
-    near = np.linalg.norm(found.xy - found.at, axis=1) <= np.maximum(3.0, 0.35 * minor)
-    centres = np.where(((correlation >= LEAST_FIT) & near)[:, None], found.xy, found.at)
-    return Examined(found.place, found.which, centres, minor, judged("fitted", found, patches, threads))
+    odds = judged("posed", before, patches, threads)
+    hopeful = odds >= HOPELESS
+    found = fitted(picture, before[hopeful], patches)
+    odds = (odds[hopeful] + judged("fitted", found, patches, threads)) / 2
+    best = likeliest(found.place, odds)
+    return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))
 
 
 def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Hypotheses:
@@ -192,22 +188,19 @@ def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patc
             np.log(minor),
         ]
     )
-    return Hypotheses(place, xy[place], which, poses.xy, poses.A, view, evidence)
+    return Hypotheses(place, xy[place], which, poses.xy, poses.A, view, evidence)[contrast > FAINTEST]
 
 
-def worth_a_fit(before: Hypotheses, probability: Float) -> NDArray[np.int64]:
-    """The likeliest hypothesis of every place (indices), without the hopeless ones."""
-    order = np.lexsort((-probability, before.place))
-    likeliest = order[np.flatnonzero(np.diff(before.place[order], prepend=-1))]
-    return likeliest[probability[likeliest] >= HOPELESS]
+def likeliest(place: NDArray[np.int64], odds: Float) -> NDArray[np.int64]:
+    """The likeliest hypothesis of every place (indices of hypotheses), in the order of the places."""
+    order = np.lexsort((-odds, place))
+    return order[np.flatnonzero(np.diff(place[order], prepend=-1))]
 
 
 def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
-    """Hypotheses with the pose that fits the pixels best, without those that are too faint for a fit."""
+    """The same hypotheses with the pose that fits the pixels best."""
     fit = refine.fit(picture.raw, before.xy, before.A, [patches[n] for n in before.which])
-    seen = np.flatnonzero(fit.white - fit.black > FAINTEST)
-    before, fit = before[seen], fit[seen]
-    contrast, minor = fit.white - fit.black, _minor(fit.A)
+    contrast, minor = np.maximum(fit.white - fit.black, FAINTEST), _minor(fit.A)
     moved = np.linalg.norm(fit.xy - before.at, axis=1)
     unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - picture.noise**2, 0)) / contrast, 3.0)
     measured = np.column_stack(
@@ -226,11 +219,11 @@ def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hy
 
 
 def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> Float:
-    """Probability (n,) that there is a patch, and that its centre and design are right, after a stage."""
+    """Log odds (n,) that there is a patch, and that its centre and design are right, after a stage."""
     if not len(found):
         return np.zeros(0)
     logit = _judge(stage, threads or cv2.getNumThreads()).run(None, inputs(found, patches))[0]
-    return np.asarray(1 / (1 + np.exp(-np.clip(logit, -30, 30))), np.float64)
+    return np.asarray(np.clip(logit, -30, 30), np.float64)
 
 
 def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
