@@ -3,7 +3,8 @@
     python benchmarks/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
     python benchmarks/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
 
-The README's table and the figure show `paper-v1` at 640x480; results of another size are kept apart.
+The README's table and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another size or
+over photographs are kept apart.
 Of a scores file only what the tables need is kept: all images, and every condition and rung.
 """
 
@@ -28,7 +29,7 @@ ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "cha
 METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
 QUICK_PX = (640, 480)
-"""The size of `kpbench bench --quick`; results of another size have a folder of their own."""
+"""The size of `kpbench bench --quick`."""
 PANEL = (480, 300)
 
 HEAD = """\
@@ -52,11 +53,16 @@ def take(folder: Path) -> None:
         for key in ("confusion", "curve"):
             del scores[key]
         scores["detector"].pop("failures", None)
-        width, height = scores["provenance"]["config"]["size_px"]
-        folder_name = path.parent.name + (f"-{width}x{height}" if (width, height) != QUICK_PX else "")
-        target = RESULTS / folder_name / path.name
+        target = RESULTS / folder_name(scores["provenance"]["config"]) / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(json.dumps(scores, sort_keys=True) + "\n")
+
+
+def folder_name(config: dict[str, Any]) -> str:
+    """Results that do not compare are in folders of their own."""
+    width, height = config["size_px"]
+    size = f"-{width}x{height}" if (width, height) != QUICK_PX else ""
+    return config["suite"] + size + ("-photographs" if config["backgrounds"]["kind"] == "photographs" else "")
 
 
 def load(suite: Path) -> list[dict[str, Any]]:
@@ -107,7 +113,7 @@ def summary(runs: list[dict[str, Any]]) -> Table:
         return sum(values) / len(values)
 
     rows: list[tuple[Cell, ...]] = [
-        ("paper's network", "photographs", *(mean(t.detection_score) for t in PAPER.values()), None),
+        ("the paper's network", "photographs", *(mean(t.detection_score) for t in PAPER.values()), None),
         *(
             (
                 run["detector"]["name"],
@@ -118,7 +124,7 @@ def summary(runs: list[dict[str, Any]]) -> Table:
             for run in runs
         ),
     ]
-    return Table("", ("detection score", "images", *PAPER, "false alarms an image"), tuple(rows))
+    return Table("", ("detection score, mean of the rungs", "images", *PAPER, "false alarms an image"), tuple(rows))
 
 
 def readme(text: str, runs: list[dict[str, Any]]) -> str:

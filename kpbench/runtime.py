@@ -63,6 +63,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cv2.getNumThreads()
     options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # threads that wait take time from others
     has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     if asked == "cuda" and not has_cuda:
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")

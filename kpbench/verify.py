@@ -26,6 +26,7 @@ from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
 from kpbench.match import Picture
 from kpbench.runtime import Session, open_session
+from kpbench.workers import one_blas_thread
 
 __all__ = [
     "FITTED",
@@ -142,10 +143,11 @@ def examine(
     threads : of the judges; 0 means as many as OpenCV may use.
     """
     picture = Picture(grey)
-    before = posed(picture, xy, network_score, log_id, patches)
-    odds = judged("posed", before, patches, threads)
-    hopeful = odds >= HOPELESS
-    found = fitted(picture, before[hopeful], patches)
+    with one_blas_thread():
+        before = posed(picture, xy, network_score, log_id, patches)
+        odds = judged("posed", before, patches, threads)
+        hopeful = odds >= HOPELESS
+        found = fitted(picture, before[hopeful], patches)
     odds = (odds[hopeful] + judged("fitted", found, patches, threads)) / 2
     best = likeliest(found.place, odds)
     return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))

@@ -18,15 +18,16 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from typing import Any, TypeVar
 
 import cv2
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from kpbench.errors import DataError
 
-__all__ = ["Progress", "cores", "dask_executor", "one_thread", "run_pieces"]
+__all__ = ["Progress", "cores", "dask_executor", "one_blas_thread", "one_thread", "run_pieces"]
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -143,6 +144,17 @@ def one_thread() -> None:
     """One thread a process: BLAS's own cost more than they bring on matrices as small as ours."""
     cv2.setNumThreads(1)
     threadpool_limits(1)
+
+
+def one_blas_thread() -> AbstractContextManager[Any]:
+    """For as long as it lasts; BLAS's threads wait busily, which takes the cores from all others."""
+    limit: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
+    return limit
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    return ThreadpoolController()
 
 
 @contextmanager

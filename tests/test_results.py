@@ -24,8 +24,7 @@ def test_a_result_follows_from_its_counts_and_names_a_frozen_suite(path):
     assert scores["settings"]["eps"] == 0.1
     assert re.sub("[^A-Za-z0-9.]+", "-", scores["detector"]["name"]) == path.stem
     config = scores["provenance"]["config"]
-    size = "x".join(map(str, config["size_px"]))
-    assert path.parent.name in (config["suite"], f"{config['suite']}-{size}")
+    assert path.parent.name == leaderboard.folder_name(config)
     board = config["board"]["name"] if "board" in config else None
     size = tuple(config["size_px"])
     again = SuiteConfig(load_suite(config["suite"]), config["images"], config["seed"], size, board=board)

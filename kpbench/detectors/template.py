@@ -21,6 +21,7 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
 from kpbench.keypoints import Detections, Float, UInt8
+from kpbench.workers import one_blas_thread
 
 __all__ = ["TemplateDetector", "crossings"]
 
@@ -151,7 +152,8 @@ class TemplateDetector:
         grey = to_grey(image)
         if not grey.size:
             return Detections.none()
-        found = self.candidates(grey)
+        with one_blas_thread():
+            found = self.candidates(grey)
         score = found.score
         order = np.argsort(-score, kind="stable")
         order = order[score[order] >= self.threshold]
