@@ -139,7 +139,7 @@ def pad_to_cells(grey: UInt8) -> UInt8:
 CANDIDATE = 0.03
 """Least score of the network from which a place is worth verifying."""
 SCALES = (1.5, 0.5)
-"""Scales of the image at which candidates are looked for: small patches are found better enlarged, large ones shrunk."""
+"""Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
 SAME_PX = 3.0
 """Candidates of two scales that are nearer to each other than this are one."""
 
