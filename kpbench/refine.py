@@ -8,9 +8,8 @@ centre, affine map, perspective, both inks, and the blur. :mod:`kpbench.match` f
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import cv2
 import numpy as np
@@ -46,9 +45,6 @@ class Fit:
     blur_px: Float
     ncc: Float
     noise: Float
-
-    def __getitem__(self, keep: Any) -> Fit:
-        return Fit(*(getattr(self, f.name)[keep] for f in fields(self)))
 
 
 def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]) -> Fit:

@@ -3,7 +3,7 @@
 A network says where it sees a keypoint and which design it takes it for. Here the likely designs are laid over
 each such place (:func:`posed`, with :mod:`kpbench.match`), what still looks like a patch is fitted to the pixels
 (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a small network judges: it sees the place in
-the frame of the patch, beside the design, and what was measured. Its answer are the log odds that there is a
+the frame of the patch, beside the design, and what was measured. Its answer is the log odds that there is a
 patch of this design at this place; the mean of both answers counts. ``benchmarks/verification.py`` trains the judges on
 synthetic images of training photographs.
 """

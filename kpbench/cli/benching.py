@@ -34,7 +34,7 @@ __all__ = ["bench"]
     show_default=True,
     help="Folder for everything; what is done there is not done again.",
 )
-@click.option("--quick", is_flag=True, help="For a laptop: in the place of --images 20 --size 640x480.")
+@click.option("--quick", is_flag=True, help="For a laptop: stands for --images 20 --size 640x480.")
 @click.option("--images", type=int, help="Base scenes, each seen with every board under every rung; default: 500.")
 @click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
 @ONLY
