@@ -4,7 +4,8 @@
 
 The sets must come from photographs that are free for fitting: `kpbench synth --n 1600 --backgrounds training/`.
 Two judges, one before the fit and one after it, of the same small network. Before the fit a hypothesis is right if its
-centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth.
+centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth. Each also
+learns by how much the pose of a hypothesis of the right design is off, if that is less than half a radius.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
 they are, by each judge, and by the mean of both, which is what the detector reports. `--write` replaces
 `posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
@@ -13,15 +14,14 @@ they are, by each judge, and by the mean of both, which is what the detector rep
 from __future__ import annotations
 
 import argparse
-import io
-import warnings
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from ellipses import affine, convolution, exported, log_of_map
 from torch import nn
 from tqdm import tqdm
 
@@ -36,38 +36,38 @@ RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 
 
 class Judge(nn.Module):
-    """A view and its design (n, 2, 32, 32), and evidence (n, columns), to logits (n,)."""
+    """A view and its design (n, 2, 32, 32), and evidence (n, columns), to log odds and how far the pose is off."""
 
     def __init__(self, evidence: np.ndarray, width: int) -> None:
         super().__init__()
         self.register_buffer("mean", torch.from_numpy(evidence.mean(axis=0)).float())
         self.register_buffer("deviation", torch.from_numpy(evidence.std(axis=0) + 1e-6).float())
         self.view = nn.Sequential(
-            *_convolution(2, width),
+            *convolution(2, width),
             nn.MaxPool2d(2),
-            *_convolution(width, 2 * width),
-            *_convolution(2 * width, 2 * width),
+            *convolution(width, 2 * width),
+            *convolution(2 * width, 2 * width),
             nn.MaxPool2d(2),
-            *_convolution(2 * width, 4 * width),
+            *convolution(2 * width, 4 * width),
             nn.MaxPool2d(2),
-            *_convolution(4 * width, 4 * width),
+            *convolution(4 * width, 4 * width),
             nn.Flatten(),
-            nn.Dropout(0.3),
-            nn.Linear(4 * width * (VIEW_PX // 8) ** 2, 64),
         )
+        size = 4 * width * (VIEW_PX // 8) ** 2
+        self.likeness = nn.Sequential(nn.Dropout(0.3), nn.Linear(size, 64))
         self.evidence = nn.Linear(evidence.shape[1], 64)
-        self.head = nn.Sequential(nn.ReLU(), nn.Dropout(0.3), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 1))
+        self.odds = nn.Sequential(nn.ReLU(), nn.Dropout(0.3), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 1))
+        self.pose = nn.Sequential(nn.Linear(size, 64), nn.ReLU(), nn.Linear(64, 5))
 
-    def forward(self, view: torch.Tensor, evidence: torch.Tensor) -> torch.Tensor:
-        """Logits (n,)."""
+    def forward(self, view: torch.Tensor, evidence: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Log odds (n,), shift (n, 2), log map (n, 2, 2)."""
         standard = ((evidence - self.mean) / self.deviation).clamp(-4, 4)  # no further than what it was trained on
         if self.training:
             standard = standard + 0.05 * torch.randn_like(standard)
-        return self.head(self.view(view) + self.evidence(standard))[:, 0]
-
-
-def _convolution(inside: int, outside: int) -> list[nn.Module]:
-    return [nn.Conv2d(inside, outside, 3, padding=1, bias=False), nn.BatchNorm2d(outside), nn.ReLU()]
+        seen = self.view(view)
+        odds = self.odds(self.likeness(seen) + self.evidence(standard))[:, 0]
+        x, y, xx, yy, xy = self.pose(seen).unbind(1)
+        return odds, torch.stack([x, y], 1), torch.stack([xx, xy, xy, yy], 1).unflatten(1, (2, 2))
 
 
 @dataclass
@@ -80,6 +80,8 @@ class Looked:
     posed: verify.Hypotheses
     odds: np.ndarray | None = None
     """By the first judge."""
+    corrected: verify.Hypotheses | None = None
+    """The posed ones, as the first judge would have them."""
     fitted: verify.Hypotheses | None = None
 
 
@@ -139,10 +141,10 @@ def main() -> None:
         before = trained([one.posed for one in training], [one.keypoints for one in training], 0.2, 8, options.epochs)
         for path, part in zip(paths, sets, strict=True):
             for one in part:
-                one.odds = odds(before, one.posed)
+                one.odds, one.corrected = judged(before, one.posed)
             # what it was trained on the first judge knows too well: of that, more is left for the second
-            least = verify.HOPELESS - (3.0 if part is not sets[-1] else 0.0)
-            hopeful = [one.posed[one.odds >= least] for one in part]
+            least = verify.HOPELESS - (2.0 if part is not sets[-1] else 0.0)
+            hopeful = [one.corrected[one.odds >= least] for one in part]
             found = pool.map(partial(fit, path), range(len(part)), hopeful)
             for one, after in zip(part, tqdm(found, f"fit {path}", len(part), leave=False), strict=True):
                 one.fitted = after
@@ -171,6 +173,9 @@ def trained(
     kept = [np.flatnonzero(r | (rng.random(len(r)) < share)) for r in right]
     tensors = [_tensors(f[k]) for f, k in zip(found, kept, strict=True) if len(k)]
     view, evidence = (torch.cat(parts) for parts in zip(*tensors, strict=True))
+    off = [errors(f[k], t) for f, k, t in zip(found, kept, truths, strict=True)]
+    near, shift, log_map = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*off, strict=True))
+    shift, log_map = shift.float(), log_map.float()
     target = torch.from_numpy(np.concatenate([r[k] for r, k in zip(right, kept, strict=True)])).float()
     weight = torch.where(target > 0, 1.0, 1 / share)
     judge = Judge(evidence.numpy(), width)
@@ -180,8 +185,11 @@ def trained(
     progress = tqdm(total=steps, desc=f"train on {len(target)}, {known.mean():.0%} right", leave=False)
     for _ in range(epochs):
         for rows in torch.randperm(len(target)).split(BATCH)[: len(target) // BATCH]:
-            logit = judge(_disturbed(view[rows]), evidence[rows])
+            logit, shifted, mapped = judge(_disturbed(view[rows]), evidence[rows])
             loss = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
+            if (own := near[rows]).any():
+                loss = loss + nn.functional.smooth_l1_loss(shifted[own], shift[rows][own], beta=0.02)
+                loss = loss + nn.functional.smooth_l1_loss(mapped[own], log_map[rows][own], beta=0.05)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -208,21 +216,46 @@ def _disturbed(view: torch.Tensor) -> torch.Tensor:
     return torch.cat([image, view[:, 1:]], dim=1)
 
 
+def errors(found: verify.Hypotheses, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which hypotheses are of a keypoint, of its design and less than half a radius off, and their pose's error.
+
+    Returns
+    -------
+    (n,) bool, and for those that are (n, 2) and (n, 2, 2) what :func:`verify.moved` takes; 0 for the others.
+    """
+    shift, log_map = np.zeros((len(found), 2)), np.zeros((len(found), 2, 2))
+    near = explains(found.xy, _ids(found), keypoints, 0.5)
+    if near.any():
+        centres = np.column_stack([keypoints["x"], keypoints["y"]])
+        radii = keypoints["radius_major"]
+        own = (np.linalg.norm(found.xy[near, None] - centres, axis=2) / radii).argmin(axis=1)
+        relative = np.linalg.inv(found.A[near]) @ affine(keypoints["H_patch2image"][own])
+        log_map[near] = log_of_map(relative)
+        _, true = verify.moved(found.xy[near], found.A[near], shift[near], log_map[near])
+        shift[near] = np.linalg.solve(true, (centres[own] - found.xy[near])[:, :, None])[:, :, 0]
+        near[near] = np.abs(log_map[near]).max(axis=(1, 2)) < 1.0
+    return near, shift, log_map
+
+
 @torch.inference_mode()
-def odds(judge: Judge, found: verify.Hypotheses) -> np.ndarray:
-    """Log odds of hypotheses (n,)."""
-    return judge(*_tensors(found)).double().numpy() if len(found) else np.zeros(0)
+def judged(judge: Judge, found: verify.Hypotheses) -> tuple[np.ndarray, verify.Hypotheses]:
+    """What :func:`verify.judged` gives, by a judge in PyTorch."""
+    if not len(found):
+        return np.zeros(0), found
+    odds, shift, log_map = (part.numpy() for part in judge(*_tensors(found)))
+    xy, A = verify.moved(found.xy, found.A, shift, log_map)
+    return odds.astype(np.float64), replace(found, xy=xy, A=A)
 
 
 def report(test: list[Looked], after: Judge) -> None:
     """Detection score at several rates of false alarms."""
     truths, images = sum(len(one.keypoints) for one in test), len(test)
     print(f"{images} images, {truths} keypoints\nfalse alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
-    last = [odds(after, one.fitted) for one in test]
-    both = [(one.odds[one.odds >= verify.HOPELESS] + then) / 2 for one, then in zip(test, last, strict=True)]
+    last = [judged(after, one.fitted)[0] for one in test]
+    both = [verify.combined(one.odds[one.odds >= verify.HOPELESS], then) for one, then in zip(test, last, strict=True)]
     rows = {
         "candidates": [(np.log(one.score / (1.0001 - one.score)), one.right) for one in test],
-        "first judge": [_reported(one.odds, one.posed, one.keypoints) for one in test],
+        "first judge": [_reported(one.odds, one.corrected, one.keypoints) for one in test],
         "second judge": [_reported(then, one.fitted, one.keypoints) for then, one in zip(last, test, strict=True)],
         "both": [_reported(mean, one.fitted, one.keypoints) for mean, one in zip(both, test, strict=True)],
     }
@@ -240,7 +273,7 @@ def report(test: list[Looked], after: Judge) -> None:
     print(
         f"fitted: {fits / images:.1f} of {sum(one.posed.place.max(initial=-1) + 1 for one in test) / images:.1f} places"
     )
-    for name, column, reach in (("posed", "posed", 0.2), ("fitted", "fitted", 0.1)):
+    for name, column, reach in (("posed", "posed", 0.2), ("corrected", "corrected", 0.1), ("fitted", "fitted", 0.1)):
         right = [_truths_explained(getattr(one, column), one.keypoints, reach) for one in test]
         print(f"keypoints that a {name} hypothesis explains: {sum(right) / truths:.3f}")
 
@@ -259,22 +292,9 @@ def _reported(odds: np.ndarray, found: verify.Hypotheses, keypoints: np.ndarray)
 
 
 def to_onnx(judge: Judge) -> bytes:
-    """A judge as ONNX: inputs ``view`` and ``evidence``, output ``logit``."""
-    buffer, names = io.BytesIO(), ["view", "evidence"]
+    """A judge as ONNX: inputs ``view`` and ``evidence``, outputs ``odds``, ``shift``, ``log_map``."""
     example = (torch.zeros(2, 2, VIEW_PX, VIEW_PX), torch.zeros(2, len(judge.mean)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(
-            judge,
-            example,
-            buffer,
-            dynamo=False,
-            opset_version=17,
-            input_names=names,
-            output_names=["logit"],
-            dynamic_axes={name: {0: "batch"} for name in [*names, "logit"]},
-        )
-    return buffer.getvalue()
+    return exported(judge, example, ["view", "evidence"])
 
 
 if __name__ == "__main__":

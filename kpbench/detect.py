@@ -16,11 +16,11 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench import __version__
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections, Float, UInt8
+from kpbench.geometry import suppress
+from kpbench.keypoints import Detections, UInt8
 from kpbench.program import run_program
 
 __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
@@ -168,27 +168,3 @@ def to_grey(image: UInt8) -> UInt8:
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
-
-
-def suppress(xy: Float, score: Float, distance_px: float | Float) -> NDArray[np.int64]:
-    """Non-maximum suppression: indices of the points that have no better kept one within a distance.
-
-    Parameters
-    ----------
-    xy : ndarray of shape (n, 2), px
-    score : ndarray of shape (n,)
-    distance_px : float or ndarray of shape (n,)
-        Reach of a point, over worse ones.
-
-    Returns
-    -------
-    ndarray of shape (k,), int64
-        Best first; equal scores in order of x, then y.
-    """
-    order = np.lexsort((xy[:, 1], xy[:, 0], -score))
-    reach = np.broadcast_to(np.asarray(distance_px, np.float64), score.shape)
-    kept: list[int] = []
-    for n in order:
-        if not kept or np.all(np.hypot(*(xy[kept] - xy[n]).T) >= reach[kept]):
-            kept.append(int(n))
-    return np.array(kept, np.int64)

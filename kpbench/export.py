@@ -1,10 +1,13 @@
-"""Checkpoint → one ONNX file: BatchNorm folded, float32, any batch, any size in multiples of 8."""
+"""Checkpoint → one ONNX file: BatchNorm folded, any batch, any size in multiples of 8; float32, or 8-bit integers."""
 
 from __future__ import annotations
 
 import io
 import json
+import logging
+import tempfile
 import warnings
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,14 +17,18 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from kpbench.detectors.superpoint import SCHEMA
+from kpbench.design import parse_patch
+from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
+from kpbench.geometry import resize
+from kpbench.keypoints import UInt8
 from kpbench.network import CELL, SuperPoint
 from kpbench.runtime import open_session
+from kpbench.samples import SampleConfig, load_photos, make_batch
 from kpbench.store import write_atomic
 from kpbench.train import network_of, read_checkpoint
 
-__all__ = ["Exported", "export", "fold", "to_onnx"]
+__all__ = ["Exported", "export", "export_int8", "fold", "quantise", "to_onnx"]
 
 OPSET = 17
 LARGEST_DIFFERENCE = 1e-4
@@ -106,6 +113,84 @@ def export(checkpoint: str | Path, out: str | Path) -> Exported:
         raise DataError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, expected at most 1e-4")
     write_atomic(Path(out), data)
     return Exported(len(data), content["step"], difference)
+
+
+def export_int8(model: str | Path, out: str | Path) -> Exported:
+    """Write an exported float32 ONNX file once more, in 8-bit integers: a quarter of the size, three times as fast.
+
+    The ranges of the activations are those of 40 synthetic scenes over procedural backgrounds, half of them
+    deteriorated, at the scales at which the detector looks at images.
+
+    Returns
+    -------
+    Exported
+        ``difference`` is the largest one from the float32 model's logits in a noise image.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, was not written by :func:`export`, or is in integers already.
+    """
+    import onnx
+
+    try:
+        data = Path(model).read_bytes()
+        given = onnx.load_from_string(data)
+        content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
+    except Exception as error:  # protobuf's own, which is not public, among others
+        why = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise DataError(f"{model}: cannot be read as an ONNX file of kpbench export-model ({why})") from None
+    if content.get("schema") != SCHEMA or "int8" in content:
+        raise DataError(f"{model}: expected a float32 network of kpbench export-model")
+    patches = [parse_patch(table, str(model)) for table in content["patches"]]
+    textures = load_photos(None, "training")
+    scenes = make_batch(SampleConfig("scenes", (640, 480)), patches, textures, 0, 0, 40, 0.5).images
+    sizes = [(round(scale * 640), round(scale * 480)) for scale in SCALES]
+    images = [resize(scene, *sizes[n % len(sizes)]) for n, scene in enumerate(scenes)]
+    content["int8"] = f"uint8 activations, 7-bit weights, ranges of {len(images)} scenes"
+    quantised = quantise(given, images)
+    onnx.helper.set_model_props(quantised, {"kpbench": json.dumps(content, sort_keys=True)})
+    written = cast(bytes, quantised.SerializeToString())
+    image = np.random.default_rng(0).random((1, 1, 72, 104), np.float32)
+    difference = _difference(written, image, list(open_session(data)[0].run(None, {"image": image})))
+    write_atomic(Path(out), written)
+    return Exported(len(written), content["step"], difference)
+
+
+def quantise(model: Any, images: Iterable[UInt8]) -> Any:
+    """An ONNX model of a network in 8-bit integers; the ranges of its activations are those of these grey images.
+
+    Weights keep 7 bits, so that the sums of products fit 16 on processors that have no better instruction:
+    with 8 those would saturate, and give other results than the rest.
+    """
+    import onnx
+    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
+
+    class Reader(CalibrationDataReader):  # type: ignore[misc]
+        def __init__(self) -> None:
+            self.images: Iterator[UInt8] = iter(images)
+
+        def get_next(self) -> dict[str, Any] | None:
+            image = next(self.images, None)
+            return None if image is None else {"image": np.float32(1 / 255) * pad_to_cells(image)[None, None]}
+
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "int8.onnx"
+        logging.disable(logging.WARNING)  # a hint about preprocessing, which a chain of convolutions does not need
+        try:
+            quantize_static(
+                model,
+                out,
+                Reader(),
+                quant_format=QuantFormat.QDQ,
+                per_channel=True,
+                reduce_range=True,
+                activation_type=QuantType.QUInt8,
+                weight_type=QuantType.QInt8,
+            )
+        finally:
+            logging.disable(logging.NOTSET)
+        return onnx.load(out)
 
 
 def _difference(data: bytes, image: Any, expected: list[Any]) -> float:

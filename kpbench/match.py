@@ -41,6 +41,8 @@ __all__ = [
     "pyramid",
     "search",
     "short_axis",
+    "surroundings",
+    "turn",
     "view",
 ]
 
@@ -50,6 +52,8 @@ Ints = NDArray[np.int64]
 ANGLES = 24
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
+WHOLE_PX = 5.6
+"""The whole design is compared in the coarsest level in which its short semi-axis measures as much."""
 _turn = np.arange(ANGLES) * (2 * np.pi / ANGLES)
 _circle = np.column_stack([np.cos(_turn), np.sin(_turn)])
 
@@ -80,12 +84,17 @@ class Templates:
     ink : (D, M) zero mean, unit norm.
     solve : (D, 6, M) from a difference of templates to a step in (x, y, a11, a12, a21, a22).
     sized : (D,) whether the pattern has a size of its own, which sectors have not.
+    turned : (R, M) all rotations of all inks, without those that look alike.
+    turned_which, turned_angle : (R,) the design and the rotation in radians of each.
     """
 
     points: Float
     ink: Float32
     solve: Float32
     sized: NDArray[np.bool_]
+    turned: Float32
+    turned_which: Ints
+    turned_angle: Float
 
 
 @dataclass(frozen=True)
@@ -97,17 +106,12 @@ class Bank:
     patches : the designs.
     core : the innermost sectors, over the unit disc; they look the same at every size.
     whole : the whole design, over the unit disc.
-    turned : (R, M) all rotations of all cores, without those that look alike.
-    turned_which, turned_angle : (R,) the design and the rotation in radians of each.
     picture : (D, VIEW_PX²) the designs as :func:`view` shows them, white 1 and black -1.
     """
 
     patches: tuple[Patch, ...]
     core: Templates
     whole: Templates
-    turned: Float32
-    turned_which: Ints
-    turned_angle: Float
     picture: Float32
 
 
@@ -119,26 +123,27 @@ def bank(patches: Sequence[Patch]) -> Bank:
 @lru_cache(maxsize=8)
 def _bank(patches: tuple[Patch, ...]) -> Bank:
     core = _templates(patches, (0.4, 0.7, 1.0), whole=False)
-    turned, which, angle = [], [], []
-    for n, ink in enumerate(core.ink):
-        seen: list[Float32] = []
-        for k in range(ANGLES):
-            rolled = np.roll(ink.reshape(-1, ANGLES), k, axis=1).ravel()
-            if all(rolled @ other < 0.99 for other in seen):
-                seen.append(rolled)
-                which.append(n)
-                angle.append(_turn[k])
-        turned += seen
     whole = _templates(patches, (0.25, 0.45, 0.65, 0.85), whole=True)
     picture = np.array([_look_up(_soft_ink(patch, True), _view_points()) for patch in patches], np.float32)
-    return Bank(patches, core, whole, np.array(turned), np.array(which, np.int64), np.array(angle), picture)
+    return Bank(patches, core, whole, picture)
 
 
 def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
     points = np.concatenate([r * _circle for r in rings])
     pairs = [_template(_soft_ink(patch, whole), points) for patch in patches]
     ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
-    return Templates(points, ink, solve, np.array([whole and len(p.cells[0]) > 2 for p in patches]))
+    turned, which, angle = [], [], []
+    for n, one in enumerate(ink):
+        seen: list[Float32] = []
+        for k in range(ANGLES):
+            rolled = np.roll(one.reshape(-1, ANGLES), k, axis=1).ravel()
+            if all(rolled @ other < 0.99 for other in seen):
+                seen.append(rolled)
+                which.append(n)
+                angle.append(_turn[k])
+        turned += seen
+    sized = np.array([whole and len(patch.cells[0]) > 2 for patch in patches])
+    return Templates(points, ink, solve, sized, np.array(turned), np.array(which, np.int64), np.array(angle))
 
 
 def _template(image: Float32, points: Float) -> tuple[Float, Float]:
@@ -292,23 +297,40 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
         One to D a place, in the order of the places (all D where ``margin`` is infinite);
         ``A`` maps the unit circle of ``known.core``.
     """
-    scale = RING_PX * 2.0**level
-    starts = np.searchsorted(known.turned_which, np.arange(len(known.patches)))
+    core, scale = known.core, RING_PX * 2.0**level
+    starts = np.searchsorted(core.turned_which, np.arange(len(known.patches)))
     best = np.full((len(known.patches), len(xy)), -1.0, np.float32)
     tilt = np.zeros(best.shape, np.int64)
     for k, map_ in enumerate(_tilts()):
-        values = _sample(levels, level, xy, scale[:, None, None] * map_, known.core.points)
-        value = np.maximum.reduceat(known.turned @ _normalise(values).T, starts, axis=0)
+        values = _sample(levels, level, xy, scale[:, None, None] * map_, core.points)
+        value = np.maximum.reduceat(core.turned @ _normalise(values).T, starts, axis=0)
         better = value > best
         best[better], tilt[better] = value[better], k
     place, which = np.nonzero((best >= best.max(axis=0) - margin).T)
     A = scale[place, None, None] * _tilts()[tilt[which, place]]
-    values = _sample(levels, level[place], xy[place], A, known.core.points)
-    match = np.where(known.turned_which == which[:, None], values @ known.turned.T, -np.inf)
-    angle = known.turned_angle[match.argmax(axis=1)]
+    return _turned(levels, level[place], xy[place], A, which, core)
+
+
+def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank) -> Poses:
+    """Best rotation of a design within an ellipse.
+
+    Parameters
+    ----------
+    levels : from :func:`pyramid`.
+    xy, A : (N, 2), (N, 2, 2) px; the ellipse is the image of the unit circle.
+    which : (N,) index of the design.
+    known : the designs.
+    """
+    return _turned(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, which, known.whole)
+
+
+def _turned(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, which: Ints, templates: Templates) -> Poses:
+    ncc = _normalise(_sample(levels, level, xy, A, templates.points)) @ templates.turned.T
+    best = np.where(templates.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
+    angle = templates.turned_angle[best]
     c, s = np.cos(angle), np.sin(angle)
-    A = A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
-    return Poses(xy[place], A, which, best[which, place].astype(np.float64))
+    turned = A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
+    return Poses(xy, turned, which, ncc[np.arange(len(best)), best].astype(np.float64))
 
 
 def align(levels: Sequence[Float32], poses: Poses, templates: Templates, steps: int, radius_px: float) -> Poses:
@@ -403,6 +425,25 @@ def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     slope = np.maximum(slope, 2.0)
     middle = grey[:, disc].mean(axis=1) - slope * model.mean(axis=1)
     return np.clip((grey - middle[:, None]) / slope[:, None], -2.5, 2.5), slope.astype(np.float64)
+
+
+OCTAVES = 4
+"""Octaves of :func:`surroundings`: 32 to 256 px of the image."""
+
+
+def surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = None) -> Float32:
+    """Grey values (N, OCTAVES, VIEW_PX, VIEW_PX) around places (N, 2) px: as many px of each octave.
+
+    ``A`` (N, 2, 2) turns and scales what is shown.
+    """
+    ticks = np.arange(VIEW_PX) - (VIEW_PX - 1) / 2
+    points = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
+    A = np.tile(np.eye(2), (len(xy), 1, 1)) if A is None else A
+    grey = np.empty((len(xy), OCTAVES, len(points)), np.float32)
+    for octave in range(OCTAVES):
+        level = np.full(len(xy), min(octave, len(levels) - 1))
+        grey[:, octave] = _sample(levels, level, xy, A * 2.0**octave, points)
+    return grey.reshape(-1, OCTAVES, VIEW_PX, VIEW_PX)
 
 
 SPOKES = 40

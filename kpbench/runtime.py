@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 
-__all__ = ["Session", "open_session"]
+__all__ = ["Session", "on_gpu", "open_session"]
 
 Float32 = NDArray[np.float32]
 
@@ -44,6 +44,20 @@ class OpenVinoSession:
 RUNTIMES = ("auto", "cpu", "cuda", "openvino")
 
 
+def on_gpu() -> bool:
+    """Whether networks run on CUDA here (see :func:`open_session`)."""
+    import onnxruntime
+
+    return _asked() in ("auto", "cuda") and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+
+
+def _asked() -> str:
+    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
+    if asked not in RUNTIMES:
+        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
+    return asked
+
+
 def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
 
@@ -57,18 +71,15 @@ def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
     """
     import onnxruntime
 
-    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
-    if asked not in RUNTIMES:
-        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
+    asked = _asked()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cv2.getNumThreads()
     options.log_severity_level = 3
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # threads that wait take time from others
-    has_cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
-    if asked == "cuda" and not has_cuda:
+    if asked == "cuda" and not on_gpu():
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if has_cuda and asked in ("auto", "cuda"):  # its default tries out all algorithms for every new size of input
+    if on_gpu():  # its default tries out all algorithms for every new size of input
         providers.insert(0, ("CUDAExecutionProvider", {"cudnn_conv_algo_search": "HEURISTIC"}))
     session = onnxruntime.InferenceSession(model, options, providers=providers)
     content = session.get_modelmeta().custom_metadata_map.get("kpbench", "")

@@ -147,6 +147,8 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Ten
     except Exception as error:  # protobuf's own, which is not public, among others
         why = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
+    if "int8" in content:
+        raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
     weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
     same = content.get("designs") == designs_digest(patches)
     return {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}

@@ -1,18 +1,19 @@
 """Verification: what the pixels say of the points that a network found.
 
-A network says where it sees a keypoint and which design it takes it for. Here the likely designs are laid over
-each such place (:func:`posed`, with :mod:`kpbench.match`), what still looks like a patch is fitted to the pixels
-(:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a small network judges: it sees the place in
-the frame of the patch, beside the design, and what was measured. Its answer is the log odds that there is a
-patch of this design at this place; the mean of both answers counts. ``benchmarks/verification.py`` trains the judges on
-synthetic images of training photographs.
+A network says where it sees a keypoint and which design it takes it for. Here a small network looks at the
+surroundings of each such place and says which ellipse the patch fills, if there is one (:func:`ellipses`). The likely
+designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.match`), what may be a patch is fitted
+to the pixels (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a judge, a small network too, sees
+the place in the frame of the patch, beside the design, and what was measured. It gives the log odds that there is a
+patch of this design at this place, and how far the pose is off. The weighted mean of both log odds counts.
+``benchmarks/ellipses.py`` and ``benchmarks/verification.py`` train the three, on synthetic images.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from kpbench import match, refine
 from kpbench.design import Patch
+from kpbench.geometry import suppress
 from kpbench.keypoints import Float, UInt8
 from kpbench.match import Picture
 from kpbench.runtime import Session, open_session
@@ -33,11 +35,15 @@ __all__ = [
     "POSED",
     "Examined",
     "Hypotheses",
+    "combined",
+    "distinct",
+    "ellipses",
     "examine",
     "fitted",
     "inputs",
     "judged",
     "likeliest",
+    "moved",
     "posed",
     "version",
 ]
@@ -46,7 +52,7 @@ POSED = (
     "log odds of the network's score",
     "log probability that the ID head sees a patch",
     "log probability of the design by the ID head",
-    "-log(1.01 - correlation of the innermost sectors)",
+    "log odds that an ellipse here is a patch",
     "-log(1.01 - correlation of the whole design)",
     "log of the distance from the network's place, in short semi-axes",
     "log of contrast over the range of the image",
@@ -66,17 +72,16 @@ FITTED = (
 )
 """The columns of the evidence of :func:`fitted`."""
 
-OCTAVES = 4
-"""Octaves in which a patch's core is looked for: short semi-axes from 5 px."""
 DOUBT = 3.0
 """Designs whose log-probability by the ID head is further behind the likeliest one's are not tried."""
-LIKENESS_IN_ID, FARNESS = 0.3, 2.0
-"""What a unit of likeness weighs against a unit of the ID head's log probability when a design and its octave are
-chosen, and what a unit of log distance from the network's place, px, weighs against a unit of likeness."""
-TRIED = 3
-"""Hypotheses a place that are judged before the fit."""
-HOPELESS = -3.0
+EMPTY = -4.0
+"""Log odds that an ellipse is a patch under which a place is left."""
+HOPELESS = -4.0
 """Log odds before the fit under which a hypothesis is not worth one."""
+SECOND = 0.7
+"""Weight of the second judge's log odds."""
+SAME = 0.2
+"""Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
 FAINTEST = 2.0
 """Grey levels: less than twice this between the inks is no patch; a fitted contrast counts as at least this."""
 
@@ -144,38 +149,56 @@ def examine(
     """
     picture = Picture(grey)
     with one_blas_thread():
-        before = posed(picture, xy, network_score, log_id, patches)
-        odds = judged("posed", before, patches, threads)
-        hopeful = odds >= HOPELESS
-        found = fitted(picture, before[hopeful], patches)
-    odds = (odds[hopeful] + judged("fitted", found, patches, threads)) / 2
+        before = posed(picture, xy, network_score, log_id, patches, threads)
+        odds, corrected = judged("posed", before, patches, threads)
+        hopeful = distinct(corrected, odds)
+        found = fitted(picture, corrected[hopeful], patches)
+    odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
     best = likeliest(found.place, odds)
     return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))
 
 
-def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch]) -> Hypotheses:
-    """The likeliest designs and poses of every place, at most TRIED (parameters as for :func:`examine`).
+def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
+    """What a patch at a place would fill.
 
-    The circles of an octave that is not the patch's show the background, which can look like any core. So every
-    octave's pose is laid over the whole disc before some are chosen, and moving far from the place counts against it.
+    Parameters
+    ----------
+    picture : Picture
+    xy : ndarray of shape (n, 2), px: within about half a short semi-axis of the centre.
+    threads : of the network, as for :func:`examine`.
+
+    Returns
+    -------
+    Centres (n, 2) px, symmetric maps (n, 2, 2) of the unit circle to the ellipse, px, and log odds (n,) of a patch.
     """
+    if not len(xy):
+        return xy, np.zeros((0, 2, 2)), np.zeros(0)
+    given = {"surroundings": match.surroundings(picture.smooth, xy)}
+    odds, shift, log_map = _network("ellipse", threads).run(None, given)
+    centre, A = moved(xy, np.tile(np.eye(2), (len(xy), 1, 1)), shift, log_map)
+    return centre, A, _clipped(odds)
+
+
+def moved(xy: Float, A: Float, shift: NDArray[np.float32], log_map: NDArray[np.float32]) -> tuple[Float, Float]:
+    """Poses A (n, 2, 2) after the symmetric maps exp(log_map), and places (n, 2) moved within the result."""
+    size, axes = np.linalg.eigh(log_map.astype(np.float64))
+    A = A @ np.einsum("nij,nj,nkj->nik", axes, np.exp(np.clip(size, -6, 6)), axes)
+    return xy + np.einsum("nij,nj->ni", A, shift), A
+
+
+def _clipped(odds: NDArray[np.float32]) -> Float:
+    return np.asarray(np.clip(odds, -30, 30), np.float64)
+
+
+def posed(
+    picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
+) -> Hypotheses:
+    """The likely designs at every place that may be a patch, posed (parameters as for :func:`examine`)."""
     known, levels = match.bank(patches), picture.smooth
-    octaves = min(OCTAVES, len(levels))
-    level = np.repeat(np.arange(octaves), len(xy))
+    centre, A, odds = ellipses(picture, xy, threads)
     likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
-    cores = match.search(levels, np.tile(xy, (octaves, 1)), level, known, margin=np.inf)
-    cores = match.align(levels, cores[np.tile(likely.ravel(), octaves)], known.core, 3, 0.9 * match.RING_PX)
-    whole = match.align(levels, match.extend(levels, cores, known), known.whole, 4, 5.6)
-
-    place = np.tile(np.nonzero(likely)[0], octaves)
-    moved = np.linalg.norm(whole.xy - xy[place], axis=1)
-    likeness = match.likeness(cores.ncc, whole.ncc) - FARNESS * np.log(moved + 0.5)
-    value = log_id[place, whole.which] + LIKENESS_IN_ID * likeness
-    order = np.lexsort((-value, place))
-    rank = np.arange(len(order)) - np.searchsorted(place[order], place[order])
-    best = order[rank < TRIED]
-    poses, which, place = whole[best], whole.which[best], place[best]
-
+    place, which = np.nonzero(likely & (odds >= EMPTY)[:, None])
+    poses = match.turn(levels, centre[place], A[place], which, known)
     view, contrast = match.view(levels, poses.xy, poses.A, which, known)
     minor = _minor(poses.A)
     evidence = np.column_stack(
@@ -183,9 +206,9 @@ def posed(picture: Picture, xy: Float, network_score: Float, log_id: Float, patc
             _log_odds(network_score[place]),
             np.log(np.maximum(1 - np.exp(log_id[place, -1]), 1e-4)),
             log_id[place, which],
-            -np.log(1.01 - cores.ncc[best]),
+            odds[place],
             -np.log(1.01 - poses.ncc),
-            np.log(moved[best] / minor + 0.02),
+            np.log(np.linalg.norm(poses.xy - xy[place], axis=1) / minor + 0.02),
             *_contrasts(contrast, picture),
             np.log(minor),
         ]
@@ -197,6 +220,21 @@ def likeliest(place: NDArray[np.int64], odds: Float) -> NDArray[np.int64]:
     """The likeliest hypothesis of every place (indices of hypotheses), in the order of the places."""
     order = np.lexsort((-odds, place))
     return order[np.flatnonzero(np.diff(place[order], prepend=-1))]
+
+
+def combined(before: Float, after: Float) -> Float:
+    """Log odds (n,) from those of the judges before and after the fit."""
+    return (1 - SECOND) * before + SECOND * after
+
+
+def distinct(found: Hypotheses, odds: Float) -> NDArray[np.int64]:
+    """Hypotheses that are worth a fit: not hopeless, and none that a likelier one of the same design all but covers."""
+    hopeful = np.flatnonzero(odds >= HOPELESS)
+    kept = [np.zeros(0, np.int64)]
+    for design in np.unique(found.which[hopeful]):
+        rows = hopeful[found.which[hopeful] == design]
+        kept.append(rows[suppress(found.xy[rows], odds[rows], SAME * _minor(found.A[rows]))])
+    return np.sort(np.concatenate(kept))
 
 
 def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
@@ -220,12 +258,16 @@ def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hy
     return Hypotheses(before.place, before.at, before.which, fit.xy, fit.A, view, evidence)
 
 
-def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> Float:
-    """Log odds (n,) that there is a patch, and that its centre and design are right, after a stage."""
+def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
+    """Log odds (n,) that there is a patch, and that its centre and design are right, after a stage.
+
+    And the same hypotheses with the poses that the judge takes for right.
+    """
     if not len(found):
-        return np.zeros(0)
-    logit = _judge(stage, threads or cv2.getNumThreads()).run(None, inputs(found, patches))[0]
-    return np.asarray(np.clip(logit, -30, 30), np.float64)
+        return np.zeros(0), found
+    odds, shift, log_map = _network(stage, threads).run(None, inputs(found, patches))
+    xy, A = moved(found.xy, found.A, shift, log_map)
+    return _clipped(odds), replace(found, xy=xy, A=A)
 
 
 def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
@@ -236,17 +278,21 @@ def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.
 
 
 def version() -> str:
-    """Which judges these are: the first digits of the SHA-256 of their weights."""
-    return hashlib.sha256(_weights("posed") + _weights("fitted")).hexdigest()[:8]
+    """Which networks these are: the first digits of the SHA-256 of their weights."""
+    return hashlib.sha256(b"".join(map(_weights, ("ellipse", "posed", "fitted")))).hexdigest()[:8]
 
 
-def _weights(stage: str) -> bytes:
-    return (Path(__file__).parent / "weights" / f"{stage}.onnx").read_bytes()
+def _weights(name: str) -> bytes:
+    return (Path(__file__).parent / "weights" / f"{name}.onnx").read_bytes()
+
+
+def _network(name: str, threads: int) -> Session:
+    return _opened(name, threads or cv2.getNumThreads())
 
 
 @cache
-def _judge(stage: str, threads: int) -> Session:
-    return open_session(_weights(stage), threads)[0]
+def _opened(name: str, threads: int) -> Session:
+    return open_session(_weights(name), threads)[0]
 
 
 def _contrasts(contrast: Float, picture: Picture) -> list[Float]:

@@ -7,11 +7,13 @@ import onnxruntime
 import pytest
 import torch
 
+from kpbench.design import shipped_patches
+from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
-from kpbench.export import export, fold, to_onnx
+from kpbench.export import export, export_int8, fold, to_onnx
 from kpbench.network import SuperPoint
 from kpbench.recipe import NetworkConfig, Phase, Recipe
-from kpbench.train import train
+from kpbench.train import initial_weights, train
 
 SIZES = {"widths": (4, 4, 8, 8), "depths": (1, 2, 1, 1), "head_width": 8, "descriptor_width": 8}
 
@@ -50,20 +52,53 @@ def test_folding_leaves_no_batchnorm_in_the_graph():
     assert kinds <= {"Conv", "Relu", "MaxPool", "Identity"}
 
 
-def test_export_writes_the_mean_weights_and_says_what_they_are(tmp_path):
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run of two steps, exported: its folder, and what the export said."""
+    folder = tmp_path_factory.mktemp("run")
     recipe = Recipe("tiny", (Phase(8),), network=NetworkConfig(**SIZES), batch=4)
-    (tmp_path / "photos").mkdir()
-    cv2.imwrite(str(tmp_path / "photos" / "a.png"), np.full((64, 64), 99, np.uint8))
-    assert train(recipe, tmp_path, tmp_path / "photos", workers=0, validation_images=1)
-    done = export(tmp_path / "checkpoint.safetensors", tmp_path / "tiny.onnx")
+    (folder / "photos").mkdir()
+    cv2.imwrite(str(folder / "photos" / "a.png"), np.full((64, 64), 99, np.uint8))
+    assert train(recipe, folder, folder / "photos", workers=0, validation_images=1)
+    return folder, export(folder / "checkpoint.safetensors", folder / "tiny.onnx")
+
+
+def test_export_writes_the_mean_weights_and_says_what_they_are(run):
+    folder, done = run
     assert done.difference < 1e-4
     assert done.step == 2
-    model = onnx.load(tmp_path / "tiny.onnx")
+    model = onnx.load(folder / "tiny.onnx")
     content = json.loads({p.key: p.value for p in model.metadata_props}["kpbench"])
     assert content["name"] == "tiny"
     assert content["samples"] == 8
     assert [p["id"] for p in content["patches"]] == [0, 1, 2, 3]
     assert content["recipe"]["network"]["widths"] == [4, 4, 8, 8]
+
+
+def test_eight_bits_give_nearly_the_same_and_always_the_same_file(run, tmp_path):
+    exact = run[0] / "tiny.onnx"
+    said = [export_int8(exact, tmp_path / name) for name in ("a.onnx", "b.onnx")]
+    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    assert said[0] == said[1]
+    image = np.random.default_rng(1).random((2, 1, 40, 56), np.float32)
+    both = (
+        onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"]).run(None, {"image": image})
+        for path in (exact, tmp_path / "a.onnx")
+    )
+    for wanted, got in zip(*both, strict=True):
+        assert 0 < np.abs(wanted - got).max() < 0.1 * np.abs(wanted).max()
+    assert "-8-int8-" in SuperPointDetector(tmp_path / "a.onnx").version
+
+
+def test_eight_bits_come_from_an_exported_file_and_lead_nowhere(run, tmp_path):
+    folder, _ = run
+    export_int8(folder / "tiny.onnx", tmp_path / "int8.onnx")
+    with pytest.raises(DataError, match=r"int8\.onnx: expected a float32 network"):
+        export_int8(tmp_path / "int8.onnx", tmp_path / "twice.onnx")
+    with pytest.raises(DataError, match=r"int8\.onnx: holds 8-bit integers; start from the float32 file"):
+        initial_weights(tmp_path / "int8.onnx", shipped_patches())
+    with pytest.raises(DataError, match=r"checkpoint\.safetensors: cannot be read as an ONNX file"):
+        export_int8(folder / "checkpoint.safetensors", tmp_path / "no.onnx")
 
 
 def test_a_file_that_is_no_checkpoint_is_one_line(tmp_path):

@@ -56,7 +56,7 @@ def test_templates_are_normalised_and_rotations_are_the_symmetries_less():
         assert np.abs(templates.ink.mean(axis=1)).max() < 1e-6
         assert np.linalg.norm(templates.ink, axis=1) == pytest.approx(1)
     checker = next(n for n, p in enumerate(PATCHES) if p.name == "checker")
-    assert (KNOWN.turned_which == checker).sum() == 12  # 24 rotations, half of them alike
+    assert (KNOWN.core.turned_which == checker).sum() == 12  # 24 rotations, half of them alike
 
 
 def test_pyramid_levels_share_their_origin():

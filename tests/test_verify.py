@@ -41,9 +41,15 @@ def test_the_pixels_outvote_a_network_that_is_not_sure_of_the_design(said):
 
 
 def test_what_is_no_patch_scores_low():
+    image, _, which = scene()
+    image[90:, 20:40] = 20  # the corners of a stripe
+    assert np.all(examined(image, [[20.0, 90.0], [40.0, 90.0]], which).score < 0.5)
+
+
+def test_a_place_beside_the_centre_leads_to_it():
     image, xy, which = scene()
-    place = [[xy[0, 0] + 8, xy[0, 1]]]  # 8 px beside a centre
-    assert np.all(examined(image, place, which[:1]).score < 0.5)
+    found = examined(image, [xy[0] + [8.0, 0.0]], which[:1])
+    np.testing.assert_allclose(found.xy, xy[:1], atol=0.02)
 
 
 def test_bare_ground_is_nothing_whatever_the_network_says():
@@ -62,7 +68,6 @@ def test_every_place_has_one_answer_the_likeliest():
 
 
 def test_a_small_patch_is_not_taken_for_a_large_one_that_the_background_resembles():
-    """The core of octave 3, 24 px, can fit the background better than that of octave 0 fits the patch."""
     ground = np.full((160, 160), 60, np.uint8)
     ground[:80, :80] = ground[80:, 80:] = 200  # a chequer whose middle is the patch's own place
     small = Placement(PATCHES[2], np.array([[6.0, 0.5, 80.3], [-0.5, 6.0, 79.6], [0.0, 0.0, 1.0]]), 20.0, 230.0)
@@ -73,13 +78,50 @@ def test_a_small_patch_is_not_taken_for_a_large_one_that_the_background_resemble
     assert found.minor_px[0] == pytest.approx(rendered.keypoints["radius_minor"][0], rel=0.05)
 
 
+def test_of_hypotheses_of_one_design_that_cover_each_other_the_likeliest_is_fitted():
+    xy = np.array([[50.0, 50.0], [51.0, 50.0], [50.5, 50.0], [58.0, 50.0], [90.0, 50.0]])
+    which, odds = np.array([0, 0, 1, 0, 0]), np.array([1.0, 2.0, -1.0, 0.5, verify.HOPELESS - 0.1])
+    A = np.tile(np.eye(2) * 10, (5, 1, 1))
+    nothing = np.zeros((5, 0))
+    found = verify.Hypotheses(np.arange(5), xy, which, xy, A, nothing, nothing)
+    assert verify.distinct(found, odds).tolist() == [1, 2, 3]
+    assert verify.distinct(found[:0], odds[:0]).tolist() == []
+
+
+def test_an_ellipse_is_found_from_half_a_radius_off():
+    image, xy, _ = scene()
+    true = [np.array([[12.0, 2.0], [-1.0, 9.0]]), np.array([[0.0, -30.0], [30.0, 0.0]])]
+    for n, A in enumerate(true):
+        A = A - np.outer(xy[n], [0.0, 0.001] if n == 0 else [0.0005, 0.0])  # of the perspective
+        off = A @ [0.3, -0.35]
+        centre, map_, odds = verify.ellipses(verify.Picture(image), xy[n : n + 1] + off)
+        assert np.linalg.norm(np.linalg.solve(A, centre[0] - xy[n])) < 0.15
+        stretch = np.linalg.svd(np.linalg.solve(A, map_[0]), compute_uv=False)
+        assert stretch == pytest.approx([1.0, 1.0], abs=0.2)
+        assert odds[0] > 2
+
+
+def test_a_symmetric_map_and_a_shift_within_it_move_a_pose():
+    xy, A = verify.moved(
+        np.array([[5.0, 6.0]]),
+        np.array([[[0.0, -2.0], [2.0, 0.0]]]),
+        np.array([[0.5, 0.0]], np.float32),
+        np.array([np.diag([np.log(3), 0.0])], np.float32),
+    )
+    np.testing.assert_allclose(A[0], [[0.0, -2.0], [6.0, 0.0]], atol=1e-6)
+    np.testing.assert_allclose(xy[0], [5.0, 9.0], atol=1e-6)
+
+
 def test_evidence_has_a_column_for_each_name_and_none_for_no_places():
     image, xy, _ = scene()
     log_id = np.log(np.full((2, len(PATCHES) + 1), 0.2))
     picture = verify.Picture(image)
     for count in (2, 0):
         posed = verify.posed(picture, xy[:count], np.full(count, SURE), log_id[:count], PATCHES)
-        assert posed.evidence.shape == (verify.TRIED * count, len(verify.POSED))
+        assert posed.evidence.shape == (len(posed), len(verify.POSED))
+        assert sorted(set(posed.place.tolist())) == list(range(count))
         fitted = verify.fitted(picture, posed, PATCHES)
         assert fitted.evidence.shape == (len(posed), len(verify.FITTED))
-        assert verify.judged("fitted", fitted, PATCHES).shape == (len(posed),)
+        odds, corrected = verify.judged("fitted", fitted, PATCHES)
+        assert odds.shape == (len(posed),)
+        assert corrected.xy.shape == fitted.xy.shape

@@ -79,16 +79,20 @@ def train(
 @click.command("export-model")
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="ONNX file to write.")
-def export_model(checkpoint: Path, out: Path) -> None:
+@click.option("--int8", is_flag=True, help="Write an exported ONNX file again in 8-bit integers, for processors.")
+def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
     """Write the trained network as one ONNX file, and check it against PyTorch.
+
+    With --int8 that file is read instead of a checkpoint.
 
     \b
     Example:
       kpbench export-model runs/superpoint-small/checkpoint.safetensors --out superpoint-small.onnx
+      kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
     """
     try:
-        from kpbench.export import export
+        from kpbench.export import export, export_int8
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench export-model {INSTALL} ({error})") from None
-    done = export(checkpoint, out)
-    click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from PyTorch by at most {done.difference:.1e}")
+    done, model = (export_int8(checkpoint, out), "float32") if int8 else (export(checkpoint, out), "PyTorch")
+    click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {model} by at most {done.difference:.1e}")

@@ -1,0 +1,262 @@
+"""Train the network of :func:`kpbench.verify.ellipses` on synthetic sets, and show what it gives on another set.
+
+    python benchmarks/ellipses.py DATASET ... --test DATASET [--write]
+
+The sets must come from photographs that are free for fitting: `kpbench synth --n 1600 --backgrounds training/`.
+The network sees the surroundings of a place in four octaves and says whether it lies on a patch, where the patch's
+centre is and which ellipse it fills, whatever its design. It is shown the places that the detector's network finds
+(in sets of the designs that it knows), and others around every keypoint, all turned, mirrored and scaled at random.
+Prints for the test set, by radius, the share of centres within 0.1 and 0.2 of the major semi-axis, before and after,
+and of semi-axes within a tenth and a fifth. `--write` replaces `ellipse.onnx` of `kpbench/weights`.
+Needs `pip install 'kpbench[train]'`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import warnings
+import zlib
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+from tqdm import tqdm
+
+import kpbench
+from kpbench import match, verify
+from kpbench.detect import to_grey
+from kpbench.detectors import superpoint
+from kpbench.workers import cores, one_thread
+
+WEAKEST = 0.01
+"""Least score of the detector's network from which its places are shown."""
+NEAR, FAR = 0.6, 1.0
+"""A place within so many short semi-axes of a keypoint is on its patch; one beyond so many long ones of all on none."""
+EMPTY_PLACES, MADE_PLACES = 14, 3
+"""Places on none, most of an image; places made around each keypoint."""
+USUAL = 2.5
+"""Log of a usual radius in px, from which the network starts."""
+
+
+class Ellipse(nn.Module):
+    """Surroundings (n, 4, 32, 32), grey levels, to log odds and what :func:`kpbench.verify.moved` takes."""
+
+    def __init__(self, width: int = 32) -> None:
+        super().__init__()
+        self.body = nn.Sequential(
+            *convolution(match.OCTAVES, width, 5, 2),
+            *convolution(width, width),
+            nn.MaxPool2d(2),
+            *convolution(width, 2 * width),
+            *convolution(2 * width, 2 * width),
+            nn.MaxPool2d(2),
+            *convolution(2 * width, 3 * width),
+            nn.Flatten(),
+            nn.Linear(3 * width * (match.VIEW_PX // 8) ** 2, 192),
+            nn.ReLU(),
+            nn.Linear(192, 6),
+        )
+
+    def forward(self, surroundings: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Log odds, shift, log map."""
+        centred = surroundings - surroundings.mean((2, 3), keepdim=True)
+        out = self.body(centred / (centred.square().mean((2, 3), keepdim=True).sqrt() + 2.0))
+        xx, yy, xy = out[:, 3] + USUAL, out[:, 4] + USUAL, out[:, 5]
+        return out[:, 0], out[:, 1:3], torch.stack([xx, xy, xy, yy], 1).unflatten(1, (2, 2))
+
+
+def convolution(inside: int, outside: int, side: int = 3, stride: int = 1) -> list[nn.Module]:
+    conv = nn.Conv2d(inside, outside, side, stride, side // 2, bias=False)
+    return [conv, nn.BatchNorm2d(outside), nn.ReLU()]
+
+
+class Places(NamedTuple):
+    """n places: surroundings (n, 4, 32, 32) float16, whether on a patch, and its shift (n, 2) and log map (n, 2, 2)."""
+
+    surroundings: np.ndarray
+    on_patch: np.ndarray
+    shift: np.ndarray
+    log_map: np.ndarray
+
+
+_detector: superpoint.SuperPointDetector
+
+
+def start() -> None:
+    """What each worker process keeps."""
+    global _detector
+    one_thread()
+    superpoint.CANDIDATE = WEAKEST
+    _detector = superpoint.SmallSuperPointDetector()
+
+
+def places(path: str, disturbed: bool, n: int) -> Places:
+    """Places of one image; those of the detector alone and as they are, or disturbed and more of them."""
+    image, keypoints = kpbench.open_dataset(path)[n]
+    grey = to_grey(image)
+    rng = np.random.default_rng([zlib.crc32(path.encode()), n])
+    known = {patch.patch_id for patch in _detector.patches} >= set(keypoints["patch_id"].tolist())
+    at = _detector.candidates([grey])[0][0] if known else np.zeros((0, 2))
+    which, on, off = _explained(at, keypoints)
+    centres = np.column_stack([keypoints["x"], keypoints["y"]])
+    if disturbed:
+        off[rng.permutation(np.flatnonzero(off))[EMPTY_PLACES:]] = False
+        again = np.tile(np.arange(len(keypoints)), MADE_PLACES)
+        made = centres[again] + rng.normal(0, 0.22, (len(again), 2)) * keypoints["radius_minor"][again, None]
+        at = np.concatenate([at[on], at[off], made])
+        which = np.concatenate([which[on], which[off], again])
+        on = np.repeat([True, False, True], [on.sum(), off.sum(), len(again)])
+    else:
+        at, which, on = at[on | off], which[on | off], on[on | off]
+    turn = np.tile(np.eye(2), (len(at), 1, 1))
+    for k in np.flatnonzero(rng.random(len(at)) < 0.7) if disturbed else ():
+        angle = rng.uniform(0, 2 * np.pi)
+        c, s = np.array([np.cos(angle), np.sin(angle)]) * 2 ** rng.uniform(-0.35, 0.35)
+        turn[k] = [[c, -s], [s, c]]
+    around = match.surroundings(match.Picture(grey).smooth, at, turn).astype(np.float16)
+    shift, log_map = np.zeros((len(at), 2)), np.zeros((len(at), 2, 2))
+    back = np.linalg.inv(turn[on])
+    log_map[on] = log_of_map(back @ affine(keypoints["H_patch2image"][which[on]]))
+    size, axes = np.linalg.eigh(log_map[on])
+    smaller = np.einsum("nij,nj,nkj->nik", axes, np.exp(-size), axes)
+    shift[on] = np.einsum("nij,njk,nk->ni", smaller, back, centres[which[on]] - at[on])
+    return Places(around, on, shift.astype(np.float32), log_map.astype(np.float32))
+
+
+def _explained(at: np.ndarray, keypoints: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The keypoint of each place, whether it is on its patch, and whether it is on none."""
+    if not len(keypoints):
+        return np.zeros(len(at), np.int64), np.zeros(len(at), bool), np.ones(len(at), bool)
+    distance = np.hypot(at[:, :1] - keypoints["x"], at[:, 1:] - keypoints["y"])
+    on = distance <= NEAR * keypoints["radius_minor"]
+    which = (distance / keypoints["radius_minor"]).argmin(axis=1)
+    return which, on.any(axis=1), (distance > FAR * keypoints["radius_major"]).all(axis=1)
+
+
+def affine(H: np.ndarray) -> np.ndarray:
+    """Derivatives (n, 2, 2) of homographies (n, 3, 3) at the origin."""
+    return H[:, :2, :2] / H[:, 2:, 2:] - H[:, :2, 2:] @ H[:, 2:, :2] / H[:, 2:, 2:] ** 2
+
+
+def log_of_map(A: np.ndarray) -> np.ndarray:
+    """Logarithms (n, 2, 2) of the symmetric maps that give the same ellipses as A (n, 2, 2)."""
+    square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
+    return np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("datasets", nargs="+")
+    parser.add_argument("--test", required=True)
+    parser.add_argument("--epochs", type=int, default=6)
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(cores())
+    with ProcessPoolExecutor(cores(), initializer=start) as pool:
+        parts = []
+        for path in options.datasets:
+            count = len(kpbench.open_dataset(path))
+            parts += tqdm(pool.map(partial(places, path, True), range(count), chunksize=4), path, count, leave=False)
+        network = trained(_together(parts), options.epochs)
+        count = len(kpbench.open_dataset(options.test))
+        test = list(pool.map(partial(places, options.test, False), range(count), chunksize=4))
+    report(network, _together(test), count)
+    if options.write:
+        target = Path(verify.__file__).parent / "weights" / "ellipse.onnx"
+        example = torch.zeros(2, match.OCTAVES, match.VIEW_PX, match.VIEW_PX)
+        target.write_bytes(exported(network, (example,), ["surroundings"]))
+        print(f"{target.name}: {target.stat().st_size} bytes")
+
+
+def _together(parts: list[Places]) -> list[torch.Tensor]:
+    return [torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)]
+
+
+BATCH = 256
+
+
+def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
+    """Cross-entropy of the log odds, smooth L1 of shift and log map on patches; AdamW, one cycle of learning rates."""
+    torch.manual_seed(0)
+    network = Ellipse().to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=2e-2)
+    steps = epochs * (len(data[0]) // BATCH)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
+    progress = tqdm(total=steps, desc=f"train on {len(data[0])}, {data[1].float().mean():.0%} on patches", leave=False)
+    for _ in range(epochs):
+        for rows in torch.randperm(len(data[0])).split(BATCH)[: len(data[0]) // BATCH]:
+            around, on, shift, log_map = _mirrored(*(column[rows] for column in data))
+            odds, shifted, mapped = network(around * torch.exp(0.2 * torch.randn(len(around), 1, 1, 1)))
+            loss = nn.functional.binary_cross_entropy_with_logits(odds, on.float())
+            loss = loss + 4 * nn.functional.smooth_l1_loss(shifted[on], shift[on], beta=0.03)
+            loss = loss + 3 * nn.functional.smooth_l1_loss(mapped[on], log_map[on], beta=0.05)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
+            progress.update()
+            progress.set_postfix(loss=f"{loss.item():.3f}", refresh=False)
+    progress.close()
+    return network.eval()
+
+
+def _mirrored(around: torch.Tensor, on: torch.Tensor, shift: torch.Tensor, log_map: torch.Tensor) -> list[torch.Tensor]:
+    """A batch with x, y, or both mirrored, and x and y exchanged, at random."""
+    around = around.float()
+    for axis in (0, 1):
+        if torch.rand(()) < 0.5:
+            sign = torch.ones(2)
+            sign[axis] = -1
+            around, shift, log_map = around.flip(3 - axis), shift * sign, log_map * sign * sign[:, None]
+    if torch.rand(()) < 0.5:
+        around, shift, log_map = around.transpose(2, 3), shift.flip(1), log_map.flip(1, 2)
+    return [around, on, shift, log_map]
+
+
+@torch.inference_mode()
+def report(network: Ellipse, test: list[torch.Tensor], images: int) -> None:
+    """How near the ellipses are to the truth, by short semi-axis, and what the log odds tell."""
+    around, on, shift, log_map = test
+    out = [network(part.float()) for part in around.split(1024)]
+    odds, shifted, mapped = (torch.cat(column) for column in zip(*out, strict=True))
+    true_map, map_ = torch.linalg.matrix_exp(log_map[on]), torch.linalg.matrix_exp(mapped[on])
+    size = torch.linalg.eigvalsh(true_map)
+    start = torch.linalg.vector_norm(true_map @ shift[on, :, None], dim=1)[:, 0] / size[:, 1]
+    missed = map_ @ shifted[on, :, None] - true_map @ shift[on, :, None]
+    error = torch.linalg.vector_norm(missed, dim=1)[:, 0] / size[:, 1]
+    shape = torch.linalg.eigvalsh(mapped[on] - log_map[on]).abs().amax(1)
+    print("short semi-axis   places   centre within 0.1, 0.2: before  after          semi-axes within a tenth, a fifth")
+    for low, high in ((5, 8), (8, 12), (12, 20), (20, 1000)):
+        m = (size[:, 0] >= low) & (size[:, 0] < high)
+        shares = [float((v[m] < limit).float().mean()) for v in (start, error, shape) for limit in (0.1, 0.2)]
+        print(f"{low:5} to {high:4} px   {int(m.sum()):6}" + "".join(f"{share:12.3f}" for share in shares))
+    for limit in (-6, -5, -4, -3, -2):
+        kept, others = float((odds[on] >= limit).float().mean()), int((odds[~on] >= limit).sum()) / images
+        print(f"log odds from {limit}: {kept:.4f} of those on patches, {others:.1f} others an image")
+
+
+def exported(network: nn.Module, example: tuple[torch.Tensor, ...], inputs: list[str]) -> bytes:
+    """A network as ONNX, for any number of places: these inputs, outputs ``odds``, ``shift``, ``log_map``."""
+    buffer, outputs = io.BytesIO(), ["odds", "shift", "log_map"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            network,
+            example,
+            buffer,
+            dynamo=False,
+            opset_version=17,
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes={name: {0: "places"} for name in [*inputs, *outputs]},
+        )
+    return buffer.getvalue()
+
+
+if __name__ == "__main__":
+    main()
