@@ -50,6 +50,8 @@ Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
 ANGLES = 24
+TURNS = 72
+"""Rotations of the whole design that are tried: to within 2.5 degrees, where a fit can start."""
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 WHOLE_PX = 5.6
@@ -133,14 +135,17 @@ def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) ->
     pairs = [_template(_soft_ink(patch, whole), points) for patch in patches]
     ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
     turned, which, angle = [], [], []
-    for n, one in enumerate(ink):
+    for n, patch in enumerate(patches):
+        image = _soft_ink(patch, whole)
         seen: list[Float32] = []
-        for k in range(ANGLES):
-            rolled = np.roll(one.reshape(-1, ANGLES), k, axis=1).ravel()
-            if all(rolled @ other < 0.99 for other in seen):
-                seen.append(rolled)
+        for turn in np.arange(TURNS if whole else ANGLES) * (2 * np.pi / (TURNS if whole else ANGLES)):
+            c, s = np.cos(turn), np.sin(turn)
+            grey = _look_up(image, points @ np.array([[c, -s], [s, c]]))
+            one = ((grey - grey.mean()) / np.linalg.norm(grey - grey.mean())).astype(np.float32)
+            if all(one @ other < 0.998 for other in seen):
+                seen.append(one)
                 which.append(n)
-                angle.append(_turn[k])
+                angle.append(turn)
         turned += seen
     sized = np.array([whole and len(patch.cells[0]) > 2 for patch in patches])
     return Templates(points, ink, solve, sized, np.array(turned), np.array(which, np.int64), np.array(angle))
@@ -325,12 +330,25 @@ def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
 
 
 def _turned(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, which: Ints, templates: Templates) -> Poses:
-    ncc = _normalise(_sample(levels, level, xy, A, templates.points)) @ templates.turned.T
+    values = _sample(levels, level, xy, A, templates.points)
+    ncc = _normalise(values) @ templates.turned.T
+    cut, outside = _outside(levels[0], xy, A, templates.points)
+    ncc[cut] = _partial_ncc(values[cut], ~outside, templates.turned)
     best = np.where(templates.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
     angle = templates.turned_angle[best]
     c, s = np.cos(angle), np.sin(angle)
     turned = A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
     return Poses(xy, turned, which, ncc[np.arange(len(best)), best].astype(np.float64))
+
+
+def _partial_ncc(values: Float32, inside: NDArray[np.bool_], inks: Float32) -> Float32:
+    """Correlations (N, R) of grey values (N, M) with inks (R, M), over those samples of each row that are inside."""
+    count = np.maximum(inside.sum(axis=1, keepdims=True), 1)
+    grey = np.where(inside, values - (values * inside).sum(axis=1, keepdims=True) / count, 0)
+    mask = inside.astype(np.float32)
+    size = np.einsum("nm,nm->n", grey, grey)[:, None] + FLOOR**2 * count
+    spread = mask @ (inks**2).T - (mask @ inks.T) ** 2 / count
+    return np.asarray(grey @ inks.T / np.sqrt(size * np.maximum(spread, 1e-3)), np.float32)
 
 
 def align(levels: Sequence[Float32], poses: Poses, templates: Templates, steps: int, radius_px: float) -> Poses:

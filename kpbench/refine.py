@@ -64,12 +64,12 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
         level = np.clip(octave, 0, len(levels) - 1).astype(np.int64).tolist()
         states = [_scaled(state, -n) for state, n in zip(states, level, strict=True)]
         for step in range(steps):
-            boxes = [_box(state, patch.extent) for state, patch in zip(states, patches, strict=True)]
-            covers = coverage([_outline(*pair) for pair in zip(states, patches, strict=True)], boxes)
-            states = [
-                _step(state, levels[n], box, cover, patch.extent, last=largest_px > 30 and step == steps - 1)
-                for state, n, box, cover, patch in zip(states, level, boxes, covers, patches, strict=True)
-            ]
+            live = [n for n, state in enumerate(states) if state.moved > SETTLED]
+            boxes = [_box(states[n], patches[n].extent) for n in live]
+            covers = coverage([_outline(states[n], patches[n]) for n in live], boxes)
+            for n, box, cover in zip(live, boxes, covers, strict=True):
+                last = largest_px > 30 and step == steps - 1
+                states[n] = _step(states[n], levels[level[n]], box, cover, patches[n].extent, last)
         states = [_scaled(state, n) for state, n in zip(states, level, strict=True)]
     columns = [np.array([getattr(s, name) for s in states]) for name in ("black", "white", "blur", "ncc", "noise")]
     xy, A = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A"))
@@ -89,14 +89,23 @@ class _State:
     white: float = 0.0
     ncc: float = 0.0
     noise: float = np.inf
+    moved: float = np.inf  # by the last step, in short semi-axes
+
+
+SETTLED = 0.002
+"""Short semi-axes: after a step that moved a patch by less it is left, as the next one would hardly move it at all."""
 
 
 def _scaled(state: _State, octaves: int) -> _State:
     """From px of the image to px of a level (``octaves`` < 0), or back; a level adds 0.6 of its px of blur."""
-    factor, added = 2.0**octaves, 0.6 if octaves else 0.0
+    if not octaves:
+        return state
+    factor, added = 2.0**octaves, 0.6
     blur = state.blur * factor
     blur = np.hypot(blur, added) if octaves < 0 else np.sqrt(max(blur**2 - (added * factor) ** 2, 0.04))
-    return replace(state, xy=state.xy * factor, A=state.A * factor, window=state.window * factor, blur=float(blur))
+    return replace(
+        state, xy=state.xy * factor, A=state.A * factor, window=state.window * factor, blur=float(blur), moved=np.inf
+    )
 
 
 BEYOND = 1.3
@@ -206,7 +215,8 @@ def _moved(state: _State, normal: Float, target: Float, minor: float, extent: fl
     blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[10], -1, 1), 0.04, (0.5 * minor) ** 2)))
     bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
     bend *= min(1.0, 0.56 / (BEYOND * extent * max(float(np.hypot(*bend)), 1e-9)))  # the model stays before the camera
-    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur)
+    moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
+    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved)
 
 
 BEND = 1 / 400

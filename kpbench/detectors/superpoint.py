@@ -114,7 +114,8 @@ def identify(id_logits: Float32, xy: Float) -> Float:
 def keypoint_probability(detector_logits: Float32) -> Float32:
     """Softmax over each cell, laid out as an image: (65, h, w) to (8h, 8w)."""
     _, h, w = detector_logits.shape
-    share = np.exp(detector_logits - detector_logits.max(axis=0))
+    logits = (detector_logits - detector_logits.max(axis=0)).reshape(len(detector_logits), -1)
+    share = cv2.exp(logits).reshape(detector_logits.shape)  # a third of NumPy's time
     share = share[:-1] / share.sum(axis=0)
     return np.ascontiguousarray(share.reshape(CELL, CELL, h, w).transpose(2, 0, 3, 1).reshape(CELL * h, CELL * w))
 
