@@ -2,11 +2,11 @@
 
     python benchmarks/detect.py DATASET [--images 20] [--superpoint FILE.onnx]
 
-For each detector, one image at a time, medians over the images: the network at all scales that it looks at; the whole
-step, with decoding and verification by the designs; and the step without verification, at one scale. The rival is
-SuperPoint's network of the paper's size (64-64-128-128, 256) with random weights in PyTorch, the network alone: its
-decoding is not counted. Runs are interleaved, so that a machine that slows down slows all. `--superpoint` times a
-full-size model too.
+For each detector, one image at a time, medians over the images: the network at all scales that it looks at; that with
+its decoding, which gives places; the whole step, with verification by the designs; and the step without it, at one
+scale. The rival is SuperPoint's network of the paper's size (64-64-128-128, 256) with random weights in PyTorch, the
+network alone: its decoding is not counted. Runs are interleaved, so that a machine that slows down slows all.
+`--superpoint` times a full-size model too.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ def main() -> None:
     steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}
     for name, (detector, alone) in detectors.items():
         steps[f"{name}: network"] = lambda image, d=detector: [d.heads([view]) for view in _views(image, d.scales)]
+        steps[f"{name}: places"] = lambda image, d=detector: d.candidates([image])
         steps[f"{name}: whole"] = detector
         steps[f"{name}: not verified"] = alone
     seconds: dict[str, list[float]] = {name: [] for name in steps}
@@ -63,8 +64,9 @@ def main() -> None:
         median = np.median(times)
         print(f"{name:32} {1e3 * median:8.1f} ms {1 / median:7.1f} images/s {floor / median:6.1f} x")
     for name in detectors:
-        after = np.median(np.subtract(seconds[f"{name}: whole"], seconds[f"{name}: network"]))
-        print(f"{name}: after the network {after / np.median(seconds[f'{name}: network']):.0%} of its time")
+        network, places, whole = (np.median(seconds[f"{name}: {step}"]) for step in ("network", "places", "whole"))
+        decoding, verification = places / network - 1, (whole - places) / network
+        print(f"{name}: decoding {decoding:.0%} of the network's time, verification {verification:.0%}")
 
 
 def _views(image: np.ndarray, scales: tuple[float, ...]) -> list[np.ndarray]:
