@@ -82,6 +82,11 @@ SECOND = 0.7
 """Weight of the second judge's log odds."""
 SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
+UNSURE, SEEN, SMALL_PX = 0.0, 0.2, 7.0
+"""An ellipse of log odds under the first, at a place where the detector's network gives at least the second, and of a
+short semi-axis under the third is looked at again, twice as large: the training showed none under 5 px."""
+BLOCK = 2**11
+"""Places whose surroundings are looked at together: memory does not grow with the image."""
 FAINTEST = 2.0
 """Grey levels: less than twice this between the inks is no patch; a fitted contrast counts as at least this."""
 
@@ -158,25 +163,39 @@ def examine(
     return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))
 
 
-def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
+def ellipses(picture: Picture, xy: Float, network_score: Float, threads: int = 0) -> tuple[Float, Float, Float]:
     """What a patch at a place would fill.
 
     Parameters
     ----------
     picture : Picture
     xy : ndarray of shape (n, 2), px: within about half a short semi-axis of the centre.
+    network_score : ndarray of shape (n,), in [0, 1]
     threads : of the network, as for :func:`examine`.
 
     Returns
     -------
     Centres (n, 2) px, symmetric maps (n, 2, 2) of the unit circle to the ellipse, px, and log odds (n,) of a patch.
     """
-    if not len(xy):
-        return xy, np.zeros((0, 2, 2)), np.zeros(0)
-    given = {"surroundings": match.surroundings(picture.smooth, xy)}
-    odds, shift, log_map = _network("ellipse", threads).run(None, given)
-    centre, A = moved(xy, np.tile(np.eye(2), (len(xy), 1, 1)), shift, log_map)
-    return centre, A, _clipped(odds)
+    centre, A, odds = _look(picture, xy, 1.0, threads)
+    unsure = np.flatnonzero((odds < UNSURE) & (network_score >= SEEN) & (match.short_axis(A) < SMALL_PX))
+    nearer = _look(picture, xy[unsure], 0.5, threads)
+    better = (nearer[2] > odds[unsure]) & (match.short_axis(nearer[1]) < SMALL_PX)
+    for far, near in zip((centre, A, odds), nearer, strict=True):
+        far[unsure[better]] = near[better]
+    return centre, A, odds
+
+
+def _look(picture: Picture, xy: Float, px: float, threads: int) -> tuple[Float, Float, Float]:
+    """:func:`ellipses` by one look, at so many px of the image a px."""
+    parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
+    for block in np.split(xy, range(BLOCK, len(xy), BLOCK)) if len(xy) else ():
+        frame = np.tile(np.eye(2) * px, (len(block), 1, 1))
+        given = {"surroundings": match.surroundings(picture.smooth, block, frame)}
+        odds, shift, log_map = _network("ellipse", threads).run(None, given)
+        parts.append((*moved(block, frame, shift, log_map), _clipped(odds)))
+    centre, A, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return centre, A, sure.astype(np.float64)
 
 
 def moved(xy: Float, A: Float, shift: NDArray[np.float32], log_map: NDArray[np.float32]) -> tuple[Float, Float]:
@@ -195,7 +214,7 @@ def posed(
 ) -> Hypotheses:
     """The likely designs at every place that may be a patch, posed (parameters as for :func:`examine`)."""
     known, levels = match.bank(patches), picture.smooth
-    centre, A, odds = ellipses(picture, xy, threads)
+    centre, A, odds = ellipses(picture, xy, network_score, threads)
     likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
     place, which = np.nonzero(likely & (odds >= EMPTY)[:, None])
     poses = match.turn(levels, centre[place], A[place], which, known)
@@ -241,14 +260,14 @@ def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hy
     """The same hypotheses with the pose that fits the pixels best."""
     fit = refine.fit(picture.raw, before.xy, before.A, [patches[n] for n in before.which])
     contrast, minor = np.maximum(fit.white - fit.black, FAINTEST), _minor(fit.A)
-    moved = np.linalg.norm(fit.xy - before.at, axis=1)
+    gone = np.linalg.norm(fit.xy - before.at, axis=1)
     unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - picture.noise**2, 0)) / contrast, 3.0)
     measured = np.column_stack(
         [
             -np.log(1.01 - fit.ncc),
             np.log(unexplained + 0.02),
             np.minimum(fit.blur_px / minor, 1.0),
-            np.log(moved / minor + 0.02),
+            np.log(gone / minor + 0.02),
             *_contrasts(contrast, picture),
             np.log(minor),
         ]
