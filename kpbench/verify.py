@@ -82,9 +82,6 @@ SECOND = 0.7
 """Weight of the second judge's log odds."""
 SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
-UNSURE, SEEN, SMALL_PX = 0.0, 0.2, 7.0
-"""An ellipse of log odds under the first, at a place where the detector's network gives at least the second, and of a
-short semi-axis under the third is looked at again, twice as large: the training showed none under 5 px."""
 BLOCK = 2**11
 """Places whose surroundings are looked at together: memory does not grow with the image."""
 FAINTEST = 2.0
@@ -163,37 +160,24 @@ def examine(
     return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))
 
 
-def ellipses(picture: Picture, xy: Float, network_score: Float, threads: int = 0) -> tuple[Float, Float, Float]:
+def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
     """What a patch at a place would fill.
 
     Parameters
     ----------
     picture : Picture
     xy : ndarray of shape (n, 2), px: within about half a short semi-axis of the centre.
-    network_score : ndarray of shape (n,), in [0, 1]
     threads : of the network, as for :func:`examine`.
 
     Returns
     -------
     Centres (n, 2) px, symmetric maps (n, 2, 2) of the unit circle to the ellipse, px, and log odds (n,) of a patch.
     """
-    centre, A, odds = _look(picture, xy, 1.0, threads)
-    unsure = np.flatnonzero((odds < UNSURE) & (network_score >= SEEN) & (match.short_axis(A) < SMALL_PX))
-    nearer = _look(picture, xy[unsure], 0.5, threads)
-    better = (nearer[2] > odds[unsure]) & (match.short_axis(nearer[1]) < SMALL_PX)
-    for far, near in zip((centre, A, odds), nearer, strict=True):
-        far[unsure[better]] = near[better]
-    return centre, A, odds
-
-
-def _look(picture: Picture, xy: Float, px: float, threads: int) -> tuple[Float, Float, Float]:
-    """:func:`ellipses` by one look, at so many px of the image a px."""
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for block in np.split(xy, range(BLOCK, len(xy), BLOCK)) if len(xy) else ():
-        frame = np.tile(np.eye(2) * px, (len(block), 1, 1))
-        given = {"surroundings": match.surroundings(picture.smooth, block, frame)}
+        given = {"surroundings": match.surroundings(picture.smooth, block)}
         odds, shift, log_map = _network("ellipse", threads).run(None, given)
-        parts.append((*moved(block, frame, shift, log_map), _clipped(odds)))
+        parts.append((*moved(block, np.tile(np.eye(2), (len(block), 1, 1)), shift, log_map), _clipped(odds)))
     centre, A, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
     return centre, A, sure.astype(np.float64)
 
@@ -214,7 +198,7 @@ def posed(
 ) -> Hypotheses:
     """The likely designs at every place that may be a patch, posed (parameters as for :func:`examine`)."""
     known, levels = match.bank(patches), picture.smooth
-    centre, A, odds = ellipses(picture, xy, network_score, threads)
+    centre, A, odds = ellipses(picture, xy, threads)
     likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
     place, which = np.nonzero(likely & (odds >= EMPTY)[:, None])
     poses = match.turn(levels, centre[place], A[place], which, known)
