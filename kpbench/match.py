@@ -134,11 +134,11 @@ def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) ->
     points = np.concatenate([r * _circle for r in rings])
     pairs = [_template(_soft_ink(patch, whole), points) for patch in patches]
     ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
-    turned, which, angle = [], [], []
+    turned, which, angle, turns = [], [], [], TURNS if whole else ANGLES
     for n, patch in enumerate(patches):
         image = _soft_ink(patch, whole)
         seen: list[Float32] = []
-        for turn in np.arange(TURNS if whole else ANGLES) * (2 * np.pi / (TURNS if whole else ANGLES)):
+        for turn in np.arange(turns) * (2 * np.pi / turns):
             c, s = np.cos(turn), np.sin(turn)
             grey = _look_up(image, points @ np.array([[c, -s], [s, c]]))
             one = ((grey - grey.mean()) / np.linalg.norm(grey - grey.mean())).astype(np.float32)
@@ -313,7 +313,8 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
         best[better], tilt[better] = value[better], k
     place, which = np.nonzero((best >= best.max(axis=0) - margin).T)
     A = scale[place, None, None] * _tilts()[tilt[which, place]]
-    return _turned(levels, level[place], xy[place], A, which, core)
+    ncc = _normalise(_sample(levels, level[place], xy[place], A, core.points)) @ core.turned.T
+    return _turned(xy[place], A, which, ncc, core)
 
 
 def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank) -> Poses:
@@ -326,14 +327,16 @@ def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     which : (N,) index of the design.
     known : the designs.
     """
-    return _turned(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, which, known.whole)
+    whole = known.whole
+    values = _sample(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, whole.points)
+    ncc = _normalise(values) @ whole.turned.T
+    cut, outside = _outside(levels[0], xy, A, whole.points)
+    ncc[cut] = _partial_ncc(values[cut], ~outside, whole.turned)
+    return _turned(xy, A, which, ncc, whole)
 
 
-def _turned(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, which: Ints, templates: Templates) -> Poses:
-    values = _sample(levels, level, xy, A, templates.points)
-    ncc = _normalise(values) @ templates.turned.T
-    cut, outside = _outside(levels[0], xy, A, templates.points)
-    ncc[cut] = _partial_ncc(values[cut], ~outside, templates.turned)
+def _turned(xy: Float, A: Float, which: Ints, ncc: Float32, templates: Templates) -> Poses:
+    """Poses in the rotation of their design that correlates best, by ``ncc`` (N, R)."""
     best = np.where(templates.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
     angle = templates.turned_angle[best]
     c, s = np.cos(angle), np.sin(angle)

@@ -175,7 +175,7 @@ class TemplateDetector:
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
-        whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, 5.6)
+        whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, match.WHOLE_PX)
         sure = match.likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
