@@ -10,7 +10,7 @@ An effect is recorded as a dict, its name under "effect" and the arguments of it
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -21,6 +21,7 @@ import numpy as np
 from kpbench.errors import DataError
 from kpbench.keypoints import Float, UInt8
 from kpbench.raster import Box, box_around, coverage
+from kpbench.scene import Mask
 
 __all__ = [
     "LADDER",
@@ -35,6 +36,7 @@ __all__ = [
     "flare",
     "gaussian_blur",
     "jpeg",
+    "ladder_mix",
     "low_light",
     "motion_blur",
     "noise",
@@ -45,6 +47,7 @@ __all__ = [
     "rainfall",
     "shadow",
     "shadow_edge",
+    "share_open",
 ]
 
 Effect = dict[str, Any]
@@ -315,6 +318,16 @@ def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
     return 1 - seen
 
 
+def share_open(effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
+    """The fraction of each patch (n,) that the occlusions among these effects leave open."""
+    share = np.ones(len(masks))
+    for effect in effects:
+        if effect["effect"] == "occlusion":
+            open_ = [mask.disc * (1 - occlusion_cover(effect["strips"], mask.box)) for mask in masks]
+            share *= [part.sum() / mask.disc.sum() for part, mask in zip(open_, masks, strict=True)]
+    return share
+
+
 def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) -> UInt8:
     """A lamp at (x, y) in the lens: a glow of ``strength`` grey levels that falls off with the distance, and ghosts.
 
@@ -477,6 +490,29 @@ def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[
     }
     chosen = rng.permutation(len(drawn))[: rng.integers(1, 4)]
     effects = [{"effect": name, **drawn[name]} for n, name in enumerate(drawn) if n in chosen]
+    return apply(image, rng, effects), effects
+
+
+LADDER_MIX = (
+    "occlusion", "shadow-edge", "flare", "dimming", "rain", "motion-blur", "defocus", "gaussian-blur", "blur",
+    "low-light", "noise", "jpeg",
+)  # fmt: skip
+"""What :func:`ladder_mix` draws from, in the order of scene, light, lens, sensor and file."""
+
+
+def ladder_mix(image: UInt8, rng: np.random.Generator, discs: Discs) -> tuple[UInt8, list[Effect]]:
+    """One or two effects of the ladder, at levels from nothing to their severest rung, uniform.
+
+    Parameters and returns as for :func:`paper_mix`; ``discs`` as for :func:`climb`.
+    """
+    size_px = (image.shape[1], image.shape[0])
+    chosen = rng.permutation(len(LADDER_MIX))[: rng.integers(1, 3)]
+    effects = []
+    for name in (LADDER_MIX[n] for n in sorted(chosen)):
+        rungs = LADDER[name]
+        mildest = rungs.bounds[rungs.levels[0] > rungs.levels[-1]]
+        level = round(mildest + float(rng.random()) * (rungs.levels[-1] - mildest), 2)
+        effects.append(climb(rng, name, level, size_px, discs))
     return apply(image, rng, effects), effects
 
 

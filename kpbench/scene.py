@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.design import Patch, unit_polygons
+from kpbench.errors import DataError
 from kpbench.geometry import projected_discs
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
 from kpbench.raster import Box, box_around, edge_coverage
@@ -56,6 +57,14 @@ class Limits:
     focal: tuple[float, float] = (0.6, 3.0)
     black: tuple[float, float] = (0.0, 120.0)
     white: tuple[float, float] = (180.0, 255.0)
+
+    @classmethod
+    def of_radius(cls, least_px: float, most_px: float) -> Limits:
+        """Radii before tilt in this range, and no short semi-axis under the least of them, or 5 px."""
+        if not 1 <= least_px <= most_px / 1.2 <= 4096:  # nearer ones leave hardly a tilt that keeps the short axis
+            wanted = "expected px from 1 to 4096, the second at least 1.2 times the first"
+            raise DataError(f"--radius-px is {least_px:g}:{most_px:g}, {wanted}")
+        return cls(minor_axis_px=2 * min(least_px, 5.0), radius_px=(least_px, most_px))
 
 
 @dataclass(frozen=True)

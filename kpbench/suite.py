@@ -257,10 +257,7 @@ class SuiteConfig:
         clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
         image = degrade.apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
         keypoints = clean.keypoints
-        for effect in shot.effects:
-            if effect["effect"] == "occlusion":
-                open_ = [m.disc * (1 - degrade.occlusion_cover(effect["strips"], m.box)) for m in clean.masks]
-                keypoints["visible"] *= [part.sum() / m.disc.sum() for part, m in zip(open_, clean.masks, strict=True)]
+        keypoints["visible"] *= degrade.share_open(shot.effects, clean.masks)
         keypoints["contrast"] = measure_contrast(image, clean.masks)
         sample = store.Sample(
             index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene

@@ -43,7 +43,8 @@ class SynthConfig:
     seed : any whole number from 0.
     size_px : (width, height).
     channels : 1 (grey) or 3 (RGB).
-    deteriorate : "none" or "paper" (:func:`kpbench.degrade.paper_mix`); the scenes are the same.
+    deteriorate : "none", "paper" (:func:`kpbench.degrade.paper_mix`) or "ladder" (:func:`kpbench.degrade.ladder_mix`);
+        the scenes are the same.
     shard_size : images a shard; changes the files but no image.
     backgrounds : folder of photographs, or None for procedural ones.
     distractors : look-alikes an image (:mod:`kpbench.lookalikes`), up to so many; the scenes are the same.
@@ -79,7 +80,8 @@ class SynthConfig:
         need(min(self.size_px) >= 64, f"--size is {self.size_px[0]}x{self.size_px[1]}, expected at least 64x64")
         need(max(self.size_px) <= 16384, f"--size is {self.size_px[0]}x{self.size_px[1]}, at most 16384 a side")
         need(self.channels in (1, 3), f"--channels is {self.channels}, expected 1 or 3")
-        need(self.deteriorate in ("none", "paper"), f"--deteriorate is {self.deteriorate!r}, expected none or paper")
+        modes = ("none", "paper", "ladder")
+        need(self.deteriorate in modes, f"--deteriorate is {self.deteriorate!r}, expected one of {', '.join(modes)}")
         need(0 <= self.distractors <= 1000, f"--distractors is {self.distractors}, expected a number from 0 to 1000")
         need(self.shard_size >= 1, f"--shard-size is {self.shard_size}, expected a number of images from 1")
 
@@ -132,9 +134,13 @@ class SynthConfig:
         placements = random_placements(stream(self.seed, index, SCENE), width, height, self.patches, self.limits)
         scene = render_scene(background.image, placements)
         image, effects = scene.image, list[dict[str, Any]]()
+        keypoints, masks = scene.keypoints, scene.masks
         if self.deteriorate == "paper":
             image, effects = degrade.paper_mix(image, stream(self.seed, index, DETERIORATION))
-        keypoints, masks = scene.keypoints, scene.masks
+        elif self.deteriorate == "ladder":
+            discs = np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
+            image, effects = degrade.ladder_mix(image, stream(self.seed, index, DETERIORATION), discs)
+            keypoints["visible"] *= degrade.share_open(effects, masks)
         if self.augmentation is not None:
             seed = int(stream(self.seed, index, AUGMENTATION).integers(2**31))
             image, placements = augment(image, placements, self.augmentation, seed)

@@ -97,6 +97,24 @@ def test_the_paper_mix_records_what_it_did():
     assert seen == {"shadow", "rain", "motion_blur", "blur", "brightness", "noise"}
 
 
+def test_the_ladder_mix_climbs_to_the_severest_rung_and_records_it():
+    image, discs = picture(), np.array([[60.0, 50.0, 14.0]])
+    levels: dict[str, list[float]] = {}
+    for seed in range(400):
+        result, effects = degrade.ladder_mix(image, np.random.default_rng(seed), discs)
+        assert result.shape == image.shape
+        assert 1 <= len(effects) <= 2
+        for entry in effects:
+            levels.setdefault(entry["effect"], []).append(next(v for v in entry.values() if not isinstance(v, str)))
+        if not {"noise", "low_light"} & {entry["effect"] for entry in effects}:
+            assert (degrade.apply(image, np.random.default_rng(0), effects) == result).all()
+    assert levels.keys() == {name.replace("-", "_").replace("rain", "rainfall") for name in degrade.LADDER_MIX}
+    for effect, severest in {"blur": 15, "noise": 60, "motion_blur": 30, "low_light": 9, "dimming": 40}.items():
+        assert 0.7 * severest < max(levels[effect]) <= severest
+        assert min(levels[effect]) < 0.3 * severest
+    assert min(levels["jpeg"]) < 30 < 70 < max(levels["jpeg"]) <= 100
+
+
 def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch):
     import os
 

@@ -13,6 +13,7 @@ from kpbench import store
 from kpbench.cli import main
 from kpbench.errors import DataError
 from kpbench.generation import generate, generate_part, merge
+from kpbench.scene import Limits
 from kpbench.synth import SynthConfig
 from kpbench.workers import dask_executor
 
@@ -77,14 +78,37 @@ def test_an_image_depends_on_its_index_and_not_on_n(photos):
     assert (image.image != other.image).any()
 
 
-def test_deterioration_leaves_the_scene_and_lowers_contrast(photos):
-    clean, worn = (config(photos, deteriorate=d).make(3)[0] for d in ("none", "paper"))
+@pytest.mark.parametrize("how", ["paper", "ladder"])
+def test_deterioration_leaves_the_scene_and_lowers_contrast(photos, how):
+    clean, worn = (config(photos, deteriorate=d).make(3)[0] for d in ("none", how))
     assert len(clean.keypoints)
+    hidden = any(entry["effect"] == "occlusion" for entry in worn.effects)
     for name in clean.keypoints.dtype.names:
         same = np.array_equal(clean.keypoints[name], worn.keypoints[name])
-        assert same == (name != "contrast")
+        assert same == (name != "contrast" and not (name == "visible" and hidden))
     assert clean.effects == []
     assert worn.effects
+
+
+def test_occlusion_of_the_ladder_lowers_what_is_visible():
+    for index in range(200):
+        clean, worn = (config(None, n=200, deteriorate=d).make(index)[0] for d in ("none", "ladder"))
+        entry = next((e for e in worn.effects if e["effect"] == "occlusion"), None)
+        if entry and len(clean.keypoints):
+            assert worn.keypoints["visible"].mean() < 0.99 * clean.keypoints["visible"].mean()
+            return
+    raise AssertionError("no occlusion in 200 images")
+
+
+def test_radii_are_kept_and_small_ones_asked_for(photos):
+    limits = Limits.of_radius(3, 12)
+    keypoints = np.concatenate([config(photos, limits=limits).make(n)[0].keypoints for n in range(12)])
+    assert 3 <= keypoints["radius_minor"].min() < 5
+    assert keypoints["radius_major"].max() < 13
+    assert Limits.of_radius(5, 80) == Limits()
+    for bad in ((80, 5), (3, 3), (0, 9), (float("nan"), 9), (5, 1e9)):
+        with pytest.raises(DataError, match="--radius-px is"):
+            Limits.of_radius(*bad)
 
 
 def test_broken_backgrounds_are_counted_in_the_manifest(photos, tmp_path):

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from kpbench.cli.options import PATCHES, SEED, SIZE, run_options
+from kpbench.cli.options import PATCHES, SEED, SIZE, Pair, run_options
 
 __all__ = ["export", "inspect", "merge", "preview", "synth", "verify"]
 
@@ -28,7 +28,20 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @PATCHES
 @click.option("--size", type=SIZE, default="640x480", show_default=True)
 @click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
-@click.option("--deteriorate", type=click.Choice(["none", "paper"]), default="paper", show_default=True)
+@click.option(
+    "--deteriorate",
+    type=click.Choice(["none", "paper", "ladder"]),
+    default="paper",
+    show_default=True,
+    help="As the paper does, or by one or two effects of kpbench degrade at any of their levels.",
+)
+@click.option(
+    "--radius-px",
+    type=Pair(),
+    default="5:80",
+    show_default=True,
+    help="Of the discs before tilt; no short semi-axis is under the least of them, or 5 px.",
+)
 @click.option(
     "--distractors",
     type=click.IntRange(0, 1000),
@@ -52,6 +65,7 @@ def synth(
     size: tuple[int, int],
     channels: int,
     deteriorate: str,
+    radius_px: tuple[float, float],
     distractors: int,
     augment: Path | None,
     shard_size: int,
@@ -63,12 +77,14 @@ def synth(
     Examples:
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
       kpbench synth --n 500 --patches mine.toml --patches other.toml --out own-designs
+      kpbench synth --n 500 --radius-px 3:20 --deteriorate ladder --out small-and-worn
       kpbench synth --n 500 --deteriorate none --augment pipeline.json --out augmented
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
     from kpbench.augment import load_augmentation
     from kpbench.cli.progress import write_dataset
     from kpbench.design import load_patches, shipped_patches
+    from kpbench.scene import Limits
     from kpbench.synth import SynthConfig
 
     config = SynthConfig(
@@ -77,6 +93,7 @@ def synth(
         size_px=size,
         channels=channels,
         deteriorate=deteriorate,
+        limits=Limits.of_radius(*radius_px),
         shard_size=shard_size,
         backgrounds=backgrounds,
         distractors=distractors,

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Size", "run_options"]
+__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Pair", "Size", "run_options"]
 
 
 class Size(click.ParamType[tuple[int, int]]):
@@ -60,6 +60,21 @@ class Span(click.ParamType[range]):
         except ValueError:
             self.fail(f"{value!r} is no range, expected A:B such as 0:10", param, ctx)
         return range(first, last)
+
+
+class Pair(click.ParamType[tuple[float, float]]):
+    """``LEAST:MOST`` as a tuple of numbers."""
+
+    name = "LEAST:MOST"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        if isinstance(value, tuple):
+            return value
+        try:
+            least, most = (float(part) for part in str(value).split(":"))
+        except ValueError:
+            self.fail(f"{value!r} is no pair, expected LEAST:MOST such as 5:80", param, ctx)
+        return least, most
 
 
 SIZE = Size()
