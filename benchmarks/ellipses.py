@@ -231,7 +231,7 @@ def report(network: Ellipse, test: list[torch.Tensor], images: int) -> None:
     error = torch.linalg.vector_norm(missed, dim=1)[:, 0] / size[:, 1]
     shape = torch.linalg.eigvalsh(mapped[on] - log_map[on]).abs().amax(1)
     print("short semi-axis   places   centre within 0.1, 0.2: before  after          semi-axes within a tenth, a fifth")
-    for low, high in ((5, 8), (8, 12), (12, 20), (20, 1000)):
+    for low, high in ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000)):
         m = (size[:, 0] >= low) & (size[:, 0] < high)
         shares = [float((v[m] < limit).float().mean()) for v in (start, error, shape) for limit in (0.1, 0.2)]
         print(f"{low:5} to {high:4} px   {int(m.sum()):6}" + "".join(f"{share:12.3f}" for share in shares))

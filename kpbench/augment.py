@@ -75,7 +75,9 @@ def _interpolate_masks(transform: Any) -> None:
         transform.mask_interpolation = cv2.INTER_LINEAR
 
 
-def augment(image: UInt8, placements: Sequence[Placement], pipeline: str, seed: int) -> tuple[UInt8, list[Placement]]:
+def augment(
+    image: UInt8, placements: Sequence[Placement], pipeline: str, seed: int
+) -> tuple[UInt8, list[Placement | None]]:
     """Send a scene through a pipeline.
 
     Parameters
@@ -88,7 +90,7 @@ def augment(image: UInt8, placements: Sequence[Placement], pipeline: str, seed: 
     Returns
     -------
     image : ndarray of the same shape, uint8
-    placements : those whose centres are still in the image, at their new poses.
+    placements : at their new poses; None where the centre is no longer in the image.
 
     Raises
     ------
@@ -112,8 +114,7 @@ def augment(image: UInt8, placements: Sequence[Placement], pipeline: str, seed: 
         )
     if np.array_equal(came_from, origin):
         return result, list(placements)
-    moved = [_carried(placement, came_from) for placement in placements]
-    return result, [placement for placement in moved if placement is not None]
+    return result, [_carried(placement, came_from) for placement in placements]
 
 
 @lru_cache(maxsize=2)

@@ -46,6 +46,7 @@ def facts(dataset: Dataset) -> dict[str, str]:
     size = sum(shard.bytes for shard in dataset.shards)
     made = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
     made += [f"deterioration {config['deteriorate']}"] if "deteriorate" in config else []
+    made += ["radii of {:g} to {:g} px".format(*config["limits"]["radius_px"])] if "limits" in config else []
     made += [f"up to {config['distractors']} look-alikes an image"] if config.get("distractors") else []
     made += ["an albumentations pipeline (in dataset.json)"] if config.get("augmentation") else []
     designs = [f"{patch['name']} ({patch['id']})" for patch in config.get("patches", [])]

@@ -21,7 +21,7 @@ import numpy as np
 from kpbench.errors import DataError
 from kpbench.keypoints import Float, UInt8
 from kpbench.raster import Box, box_around, coverage
-from kpbench.scene import Mask
+from kpbench.scene import Mask, inside_image
 
 __all__ = [
     "LADDER",
@@ -109,7 +109,7 @@ def brightness(image: UInt8, factor: float) -> UInt8:
     return np.asarray(cv2.LUT(image, table), np.uint8)
 
 
-@lru_cache(maxsize=2048)  # more than paper_mix has of them
+@lru_cache(maxsize=2048)  # more than paper_mix has of them; those of ladder_mix never come back
 def line_kernel(length_px: float, angle_deg: float) -> Float:
     """Exact area coverage of a line one pixel wide and ``length_px`` long through the kernel's centre."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
@@ -311,20 +311,22 @@ def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
     seen = np.ones((h, w))
     for polygon in _strips(strips):
         around = box_around([polygon])
-        x0, y0 = min(x, around[0]), min(y, around[1])
-        x1, y1 = max(x + w, around[0] + around[2]), max(y + h, around[1] + around[3])
-        cover = coverage([[polygon]], [(x0, y0, x1 - x0, y1 - y0)])[0]
-        seen *= 1 - cover[y - y0 : y - y0 + h, x - x0 : x - x0 + w]
+        shifted = (around[0] - x, around[1] - y, *around[2:])
+        there, here = inside_image(shifted, seen)
+        if seen[there].size:
+            seen[there] *= 1 - coverage([[polygon]], [around])[0][here]
     return 1 - seen
 
 
-def share_open(effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
-    """The fraction of each patch (n,) that the occlusions among these effects leave open."""
+def share_open(image: UInt8, effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
+    """The fraction of what is in the image of each patch (n,) that the occlusions among these effects leave open."""
+    strips = [effect["strips"] for effect in effects if effect["effect"] == "occlusion"]
     share = np.ones(len(masks))
-    for effect in effects:
-        if effect["effect"] == "occlusion":
-            open_ = [mask.disc * (1 - occlusion_cover(effect["strips"], mask.box)) for mask in masks]
-            share *= [part.sum() / mask.disc.sum() for part, mask in zip(open_, masks, strict=True)]
+    for n, mask in enumerate(masks) if strips else ():
+        open_ = disc = mask.disc[inside_image(mask.box, image)[1]]
+        for one in strips:
+            open_ = open_ * (1 - occlusion_cover(one, mask.box))[inside_image(mask.box, image)[1]]
+        share[n] = open_.sum() / max(disc.sum(), 1e-9)
     return share
 
 
@@ -494,7 +496,7 @@ def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[
 
 
 LADDER_MIX = (
-    "occlusion", "shadow-edge", "flare", "dimming", "rain", "motion-blur", "defocus", "gaussian-blur", "blur",
+    "occlusion", "rain", "shadow-edge", "dimming", "flare", "motion-blur", "defocus", "gaussian-blur", "blur",
     "low-light", "noise", "jpeg",
 )  # fmt: skip
 """What :func:`ladder_mix` draws from, in the order of scene, light, lens, sensor and file."""
@@ -511,7 +513,7 @@ def ladder_mix(image: UInt8, rng: np.random.Generator, discs: Discs) -> tuple[UI
     for name in (LADDER_MIX[n] for n in sorted(chosen)):
         rungs = LADDER[name]
         mildest = rungs.bounds[rungs.levels[0] > rungs.levels[-1]]
-        level = round(mildest + float(rng.random()) * (rungs.levels[-1] - mildest), 2)
+        level = round(mildest + float(rng.random()) * (rungs.levels[-1] - mildest), 0 if name == "jpeg" else 2)
         effects.append(climb(rng, name, level, size_px, discs))
     return apply(image, rng, effects), effects
 

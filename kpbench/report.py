@@ -38,8 +38,9 @@ from kpbench.exhibits import (
     taxonomy_charts,
     verdict_table,
 )
-from kpbench.paper import PAPER
+from kpbench.paper import PAPER, SYNTHETIC
 from kpbench.pose import PoseGroup
+from kpbench.scene import Limits
 from kpbench.scoring import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
@@ -141,10 +142,12 @@ def sections(report: Report) -> Iterator[Section]:
         )
     conditions = list(dict.fromkeys(name for run in runs for name in run.conditions))
     known = [PAPER[name] for name in conditions if name in PAPER]
-    if known or report.config.get("kind") == "synth":
+    deteriorate, radii = str(report.config.get("deteriorate")), list(Limits().radius_px)
+    like_the_papers = deteriorate in SYNTHETIC and report.config.get("limits", {}).get("radius_px", radii) == radii
+    if known or like_the_papers:
         tables = [paper_table(runs, table, report.images or "the user's") for table in known]
-        if report.config.get("kind") == "synth":
-            tables.append(synthetic_table(runs, str(report.config.get("deteriorate"))))
+        if like_the_papers:
+            tables.append(synthetic_table(runs, deteriorate))
         yield Section(
             "Beside the paper",
             "The paper's photographs are not public. Its numbers and ours are from different images and different "

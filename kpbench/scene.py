@@ -58,13 +58,24 @@ class Limits:
     black: tuple[float, float] = (0.0, 120.0)
     white: tuple[float, float] = (180.0, 255.0)
 
+    def __post_init__(self) -> None:
+        least, most = self.radius_px
+        if not 1 <= least <= most <= 4096:
+            raise DataError(f"--radius-px is {least:g}:{most:g}, expected px from 1 to 4096, the smaller first")
+        if 2 * most < 1.2 * self.minor_axis_px:  # else hardly a tilt keeps the short axis
+            wanted = f"expected a largest of at least {0.6 * self.minor_axis_px:g}: no short axis is under"
+            raise DataError(f"--radius-px is {least:g}:{most:g}, {wanted} {self.minor_axis_px:g} px")
+
     @classmethod
     def of_radius(cls, least_px: float, most_px: float) -> Limits:
-        """Radii before tilt in this range, and no short semi-axis under the least of them, or 5 px."""
-        if not 1 <= least_px <= most_px / 1.2 <= 4096:  # nearer ones leave hardly a tilt that keeps the short axis
-            wanted = "expected px from 1 to 4096, the second at least 1.2 times the first"
-            raise DataError(f"--radius-px is {least_px:g}:{most_px:g}, {wanted}")
-        return cls(minor_axis_px=2 * min(least_px, 5.0), radius_px=(least_px, most_px))
+        """Radii before tilt in this range, and no short semi-axis under the least of them or 5 px, whichever is less.
+
+        Raises
+        ------
+        DataError
+            If these are no two radii, or the second is less than 1.2 times the first.
+        """
+        return cls(minor_axis_px=2 * min(max(least_px, 1.0), 5.0), radius_px=(least_px, most_px))
 
 
 @dataclass(frozen=True)
@@ -236,7 +247,7 @@ def tabulate(placements: Sequence[Placement], visible: Sequence[float]) -> NDArr
     return keypoints
 
 
-def inside_image(box: Box, image: UInt8) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def inside_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Slices of the image and of the box for the part of a box that lies in the image."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])

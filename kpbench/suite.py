@@ -257,7 +257,7 @@ class SuiteConfig:
         clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
         image = degrade.apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
         keypoints = clean.keypoints
-        keypoints["visible"] *= degrade.share_open(shot.effects, clean.masks)
+        keypoints["visible"] *= degrade.share_open(image, shot.effects, clean.masks)
         keypoints["contrast"] = measure_contrast(image, clean.masks)
         sample = store.Sample(
             index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene

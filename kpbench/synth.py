@@ -83,6 +83,9 @@ class SynthConfig:
         modes = ("none", "paper", "ladder")
         need(self.deteriorate in modes, f"--deteriorate is {self.deteriorate!r}, expected one of {', '.join(modes)}")
         need(0 <= self.distractors <= 1000, f"--distractors is {self.distractors}, expected a number from 0 to 1000")
+        largest = 2 * max(self.size_px)
+        said = f"--radius-px goes up to {self.limits.radius_px[1]:g}, expected at most {largest} at this size"
+        need(self.limits.radius_px[1] <= largest, said)
         need(self.shard_size >= 1, f"--shard-size is {self.shard_size}, expected a number of images from 1")
 
     @cached_property
@@ -140,12 +143,15 @@ class SynthConfig:
         elif self.deteriorate == "ladder":
             discs = np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
             image, effects = degrade.ladder_mix(image, stream(self.seed, index, DETERIORATION), discs)
-            keypoints["visible"] *= degrade.share_open(effects, masks)
+            keypoints["visible"] *= degrade.share_open(image, effects, masks)
         if self.augmentation is not None:
             seed = int(stream(self.seed, index, AUGMENTATION).integers(2**31))
-            image, placements = augment(image, placements, self.augmentation, seed)
+            before = degrade.share_open(image, effects, masks)
+            image, moved = augment(image, placements, self.augmentation, seed)
+            placements = [placement for placement in moved if placement is not None]
             masks = tuple(rasterise(placements))
             keypoints = tabulate(placements, [share_inside(image, mask) for mask in masks])
+            keypoints["visible"] *= before[[placement is not None for placement in moved]]
             effects = [*effects, {"effect": "augmentation", "seed": seed}]
         keypoints["contrast"] = measure_contrast(image, masks)
         return Sample(index, image, keypoints, effects, background.file), background.broken

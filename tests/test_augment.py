@@ -44,7 +44,8 @@ def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
     canonical = load_augmentation(saved(tmp_path, *pipeline))
     off = []
     for seed in range(4):
-        image, carried = augment(*scene(seed), canonical, seed)
+        image, moved = augment(*scene(seed), canonical, seed)
+        carried = [placement for placement in moved if placement is not None]
         H = np.array([placement.H_patch2image for placement in carried])
         affine = H[:, :2, :2] - H[:, :2, 2:] @ H[:, 2:, :2]
         fit = refine.fit(match.pyramid(image, 0), H[:, :2, 2], affine, [p.patch for p in carried])

@@ -33,14 +33,14 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
     type=click.Choice(["none", "paper", "ladder"]),
     default="paper",
     show_default=True,
-    help="As the paper does, or by one or two effects of kpbench degrade at any of their levels.",
+    help="none; as the paper does; or one or two effects of kpbench degrade, from nothing to their last rung.",
 )
 @click.option(
     "--radius-px",
     type=Pair(),
     default="5:80",
     show_default=True,
-    help="Of the discs before tilt; no short semi-axis is under the least of them, or 5 px.",
+    help="Of the discs before tilt. No short semi-axis is under the least of them or 5 px, whichever is less.",
 )
 @click.option(
     "--distractors",

@@ -47,7 +47,7 @@ class Decoding:
     Attributes
     ----------
     threshold : float
-        Least probability that a keypoint lies in the window around a maximum, in [0, 1].
+        Least probability that a keypoint lies in the window around a maximum, in [0, 1]; what lies under 0.01 may go.
     separation_px : int
         Of two maxima closer than this the weaker one is dropped. Discs that do not overlap and whose
         short axes measure 10 px have their centres at least so far apart.
@@ -89,7 +89,7 @@ def locate(detector_logits: Float32, how: Decoding) -> tuple[Float, Float]:
     side = 2 * how.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     width, offset = 2 * how.window_px + 1, np.arange(-how.window_px, how.window_px + 1)
-    # what holds the threshold in its window has more than the mean of it at its maximum
+    # what holds the threshold in its window has at least the mean of it at its maximum
     found = np.flatnonzero(ranked > 0.5 * how.threshold / width**2)  # of two axes it takes many times as long
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])
@@ -148,6 +148,11 @@ def _at(cells: Float32, xy: Float) -> Float:
     return np.asarray((top * (1 - fy) + bottom * fy).T)
 
 
+def _inside(xy: Float, image: UInt8) -> NDArray[np.bool_]:
+    """Whether places (n, 2) px lie in the image."""
+    return np.asarray(np.all((xy > -0.5) & (xy < np.subtract(image.shape[1::-1], 0.5)), axis=1))
+
+
 def pad_to_cells(grey: UInt8) -> UInt8:
     """Repeat the last row and column until both sides are multiples of 8; (0, 0) stays where it is."""
     height, width = grey.shape
@@ -185,7 +190,7 @@ class SuperPointDetector:
     Raises
     ------
     DataError
-        If the file cannot be read or was not written by kpbench.
+        If the file cannot be read or was not written by kpbench, or the scales are none.
     """
 
     path: Path | None = None
@@ -196,6 +201,8 @@ class SuperPointDetector:
     shipped: ClassVar[str] = "superpoint"
 
     def __post_init__(self) -> None:
+        if not self.scales or not all(0 < scale <= 16 for scale in self.scales):
+            raise DataError(f"scales are {self.scales}, expected at least one, each over 0 and up to 16")
         ours = Path(__file__).parent.parent / "weights" / f"{self.shipped}{'' if on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
@@ -259,7 +266,7 @@ class SuperPointDetector:
             for parts, detector, ids in zip(found, *heads, strict=True):
                 there, score = locate(detector, how)
                 xy = (there + 0.5) / exact - 0.5
-                inside = np.all((xy > -0.5) & (xy < (width - 0.5, height - 0.5)), axis=1)
+                inside = _inside(xy, greys[0])
                 parts.append((xy[inside], score[inside], identify(ids, there[inside])))
         columns = [[np.concatenate(column) for column in zip(*parts, strict=True)] for parts in found]
         once = [suppress(xy, score, SAME_PX) for xy, score, _ in columns]
@@ -269,7 +276,7 @@ class SuperPointDetector:
         if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify.examine(grey, xy, score, log_id, self.patches, self.threads)
-        sure = np.flatnonzero(found.score >= self.threshold)
+        sure = np.flatnonzero((found.score >= self.threshold) & _inside(found.xy, grey))
         xy, score, apart = found.xy[sure], found.score[sure], 0.6 * found.minor_px[sure]
         # discs do not overlap: of two centres within one disc the likelier stays
         kept = suppress(xy, score, np.maximum(Decoding.separation_px, apart))
