@@ -4,12 +4,13 @@ Each step looks at many candidates at once:
 
 * :func:`search` finds the pose where only a rough place and scale are known: it samples the image on
   circles around the place, under a bank of tilts, and correlates with every design in every rotation;
+* :func:`turn` finds the rotation where the ellipse is known (:func:`surroundings` shows what tells it);
 * :func:`align` moves a pose onto the image (inverse compositional Gauss-Newton, Baker and Matthews,
   *Lucas-Kanade 20 years on*, IJCV 2004);
 * :func:`extend` measures how far the sectors reach, which is the patch's size;
 * :func:`view` shows the image in the frame of the patch.
 
-The first two can look at the innermost sectors alone, which are the same at every size.
+Search and alignment can look at the innermost sectors alone, which are the same at every size.
 Poses are affine: ``x_px = xy + A @ u``.
 """
 
@@ -52,6 +53,8 @@ Ints = NDArray[np.int64]
 ANGLES = 24
 TURNS = 72
 """Rotations of the whole design that are tried: to within 2.5 degrees, where a fit can start."""
+AS_LIKELY, UNLIKE = 0.15, 0.5
+"""How much less a second rotation may correlate with the image, and how little it must with the best one."""
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 WHOLE_PX = 5.6
@@ -314,11 +317,14 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
     place, which = np.nonzero((best >= best.max(axis=0) - margin).T)
     A = scale[place, None, None] * _tilts()[tilt[which, place]]
     ncc = _normalise(_sample(levels, level[place], xy[place], A, core.points)) @ core.turned.T
-    return _turned(xy[place], A, which, ncc, core)
+    best = np.where(core.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
+    return _turned(xy[place], A, which, best, ncc, core)
 
 
-def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank) -> Poses:
-    """Best rotation of a design within an ellipse.
+def turn(
+    levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank, twice: NDArray[np.bool_] | None = None
+) -> tuple[Ints, Poses]:
+    """The likely rotations of a design within an ellipse: the best, and a second one that looks as likely.
 
     Parameters
     ----------
@@ -326,22 +332,35 @@ def turn(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     xy, A : (N, 2), (N, 2, 2) px; the ellipse is the image of the unit circle.
     which : (N,) index of the design.
     known : the designs.
+    twice : (N,) where a second one is wanted; None: everywhere.
+
+    Returns
+    -------
+    Rows (M,) from 0 to N - 1, in order and each once or twice, and their poses.
     """
     whole = known.whole
     values = _sample(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, whole.points)
     ncc = _normalise(values) @ whole.turned.T
     cut, outside = _outside(levels[0], xy, A, whole.points)
     ncc[cut] = _partial_ncc(values[cut], ~outside, whole.turned)
-    return _turned(xy, A, which, ncc, whole)
+    ncc[whole.turned_which != which[:, None]] = -np.inf
+    first, every = ncc.argmax(axis=1), np.arange(len(xy))
+    unlike = whole.turned @ whole.turned.T < UNLIKE
+    second = np.where(unlike[first], ncc, -np.inf).argmax(axis=1)
+    as_likely = unlike[first, second] & (ncc[every, second] > ncc[every, first] - AS_LIKELY)
+    again = np.flatnonzero(as_likely if twice is None else as_likely & twice)
+    row = np.concatenate([every, again])
+    order = np.argsort(row, kind="stable")
+    row, turned = row[order], np.concatenate([first, second[again]])[order]
+    return row, _turned(xy[row], A[row], which[row], turned, ncc[row], whole)
 
 
-def _turned(xy: Float, A: Float, which: Ints, ncc: Float32, templates: Templates) -> Poses:
-    """Poses in the rotation of their design that correlates best, by ``ncc`` (N, R)."""
-    best = np.where(templates.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
-    angle = templates.turned_angle[best]
+def _turned(xy: Float, A: Float, which: Ints, turned: Ints, ncc: Float32, templates: Templates) -> Poses:
+    """Poses in rotations (N,) of their design, with their correlations out of ``ncc`` (N, R)."""
+    angle = templates.turned_angle[turned]
     c, s = np.cos(angle), np.sin(angle)
-    turned = A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
-    return Poses(xy, turned, which, ncc[np.arange(len(best)), best].astype(np.float64))
+    turned_A = A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0)
+    return Poses(xy, turned_A, which, ncc[np.arange(len(turned)), turned].astype(np.float64))
 
 
 def _partial_ncc(values: Float32, inside: NDArray[np.bool_], inks: Float32) -> Float32:
@@ -432,20 +451,26 @@ def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
 
     Returns
     -------
-    (N, VIEW_PX²) ink, white 1 and black -1 by the least-squares line over the disc, clipped to ±2.5; (N,) half of the
-    contrast, grey levels, at least 2, also where the inks are the other way round.
+    (N, VIEW_PX²) ink, white 1 and black -1 by the least-squares line over the disc, clipped to ±2.5, nan outside the
+    image; (N,) half of the contrast, grey levels, from 2 to 128, 2 also where the inks are the other way round.
     """
     points = _view_points()
     px = short_axis(A) * 2 * LOOKUP_HALF / VIEW_PX
     level = np.clip(np.rint(np.log2(np.maximum(px, 1e-6))), 0, len(levels) - 1).astype(np.int64)
     grey = _sample(levels, level, xy, A, points)
+    cut, outside = _outside(levels[0], xy, A, points)
+    grey[cut] = np.where(outside, np.nan, grey[cut])
     disc = np.hypot(*points.T) < 1
-    model = known.picture[which][:, disc]
-    centred = model - model.mean(axis=1, keepdims=True)
-    slope = np.einsum("nm,nm->n", grey[:, disc], centred) / np.einsum("nm,nm->n", centred, centred)
-    slope = np.maximum(slope, 2.0)
-    middle = grey[:, disc].mean(axis=1) - slope * model.mean(axis=1)
-    return np.clip((grey - middle[:, None]) / slope[:, None], -2.5, 2.5), slope.astype(np.float64)
+    part, model = grey[:, disc], known.picture[which][:, disc]
+    inside = ~np.isnan(part)
+    weight = inside / np.maximum(inside.sum(axis=1, keepdims=True), 1, dtype=np.float32)
+    part = np.where(inside, part, 0)
+    middle, mean = (np.einsum("nm,nm->n", weight, column) for column in (part, model))
+    centred = weight * (model - mean[:, None])
+    slope = np.einsum("nm,nm->n", part, centred) / (np.einsum("nm,nm->n", model, centred) + 0.01)
+    slope = np.clip(slope, 2.0, 128.0)
+    level_grey = middle - slope * mean
+    return np.clip((grey - level_grey[:, None]) / slope[:, None], -2.5, 2.5), slope.astype(np.float64)
 
 
 OCTAVES = 4

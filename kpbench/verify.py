@@ -66,6 +66,7 @@ FITTED = (
     "log of what the fit leaves unexplained, in contrasts",
     "blur in short semi-axes",
     "log of the distance from the network's place, in short semi-axes, by the fit",
+    "log of the distance from the pose before the fit, in short semi-axes",
     "log of contrast over the range of the image, by the fit",
     "log of contrast over noise, by the fit",
     "log of the short semi-axis, px, by the fit",
@@ -73,8 +74,12 @@ FITTED = (
 """The columns of the evidence of :func:`fitted`."""
 
 DOUBT = 3.0
-"""Designs whose log-probability by the ID head is further behind the likeliest one's are not tried."""
-EMPTY = -4.0
+"""Designs whose log-probability by the ID head is further behind the likeliest one's are not tried, ..."""
+SURE = 2.0
+"""... but for places that lie on a patch with these log odds: there all are."""
+TURNED_TWICE = -1.0
+"""Log odds from which two rotations of a design are tried where both look alike."""
+EMPTY = -3.5
 """Log odds that an ellipse is a patch under which a place is left."""
 HOPELESS = -4.0
 """Log odds before the fit under which a hypothesis is not worth one."""
@@ -84,6 +89,8 @@ SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
 BLOCK = 2**11
 """Places whose surroundings are looked at together: memory does not grow with the image."""
+FAR = 0.1
+"""Short semi-axes that a fit may move a centre: beyond, in blur or noise, where it began is right more often."""
 FAINTEST = 2.0
 """Grey levels: less than twice this between the inks is no patch; a fitted contrast counts as at least this."""
 
@@ -98,7 +105,7 @@ class Hypotheses:
     at : (n, 2) px, that place.
     which : (n,) index of the design.
     xy, A : (n, 2) px, (n, 2, 2) patch frame to px.
-    view : (n, VIEW_PX²) from :func:`kpbench.match.view`.
+    view : (n, VIEW_PX²) from :func:`kpbench.match.view`, nan outside the image.
     evidence : (n, len(POSED)) or (n, len(FITTED))
     """
 
@@ -123,12 +130,14 @@ class Examined:
 
     Attributes
     ----------
+    place : (n,) index of the place that was asked about.
     which : (n,) index of the likeliest design.
     xy : (n, 2) px, the fitted centre.
     minor_px : (n,) short semi-axis of the fitted disc.
     score : (n,) probability that there is a patch, and that its centre and design are right.
     """
 
+    place: NDArray[np.int64]
     which: NDArray[np.int64]
     xy: Float
     minor_px: Float
@@ -157,7 +166,8 @@ def examine(
         found = fitted(picture, corrected[hopeful], patches)
     odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
     best = likeliest(found.place, odds)
-    return Examined(found.which[best], found.xy[best], _minor(found.A[best]), 1 / (1 + np.exp(-odds[best])))
+    found, odds = found[best], odds[best]
+    return Examined(found.place, found.which, found.xy, _minor(found.A), 1 / (1 + np.exp(-odds)))
 
 
 def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
@@ -200,8 +210,9 @@ def posed(
     known, levels = match.bank(patches), picture.smooth
     centre, A, odds = ellipses(picture, xy, threads)
     likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
-    place, which = np.nonzero(likely & (odds >= EMPTY)[:, None])
-    poses = match.turn(levels, centre[place], A[place], which, known)
+    place, which = np.nonzero((likely | (odds >= SURE)[:, None]) & (odds >= EMPTY)[:, None])
+    row, poses = match.turn(levels, centre[place], A[place], which, known, (odds >= TURNED_TWICE)[place])
+    place, which = place[row], which[row]
     view, contrast = match.view(levels, poses.xy, poses.A, which, known)
     minor = _minor(poses.A)
     evidence = np.column_stack(
@@ -230,9 +241,9 @@ def combined(before: Float, after: Float) -> Float:
     return (1 - SECOND) * before + SECOND * after
 
 
-def distinct(found: Hypotheses, odds: Float) -> NDArray[np.int64]:
+def distinct(found: Hypotheses, odds: Float, least: float = HOPELESS) -> NDArray[np.int64]:
     """Hypotheses that are worth a fit: not hopeless, and none that a likelier one of the same design all but covers."""
-    hopeful = np.flatnonzero(odds >= HOPELESS)
+    hopeful = np.flatnonzero(odds >= least)
     kept = [np.zeros(0, np.int64)]
     for design in np.unique(found.which[hopeful]):
         rows = hopeful[found.which[hopeful] == design]
@@ -241,24 +252,27 @@ def distinct(found: Hypotheses, odds: Float) -> NDArray[np.int64]:
 
 
 def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
-    """The same hypotheses with the pose that fits the pixels best."""
+    """The same hypotheses with the pose that fits the pixels best, or their own where that went far away from it."""
     fit = refine.fit(picture.raw, before.xy, before.A, [patches[n] for n in before.which])
     contrast, minor = np.maximum(fit.white - fit.black, FAINTEST), _minor(fit.A)
-    gone = np.linalg.norm(fit.xy - before.at, axis=1)
+    gone, moved_on = (np.linalg.norm(fit.xy - start, axis=1) / minor for start in (before.at, before.xy))
     unexplained = np.minimum(np.sqrt(np.maximum(fit.noise**2 - picture.noise**2, 0)) / contrast, 3.0)
     measured = np.column_stack(
         [
             -np.log(1.01 - fit.ncc),
             np.log(unexplained + 0.02),
             np.minimum(fit.blur_px / minor, 1.0),
-            np.log(gone / minor + 0.02),
+            np.log(gone + 0.02),
+            np.log(moved_on + 0.02),
             *_contrasts(contrast, picture),
             np.log(minor),
         ]
     )
-    view, _ = match.view(picture.smooth, fit.xy, fit.A, before.which, match.bank(patches))
+    away = moved_on > FAR
+    xy, A = np.where(away[:, None], before.xy, fit.xy), np.where(away[:, None, None], before.A, fit.A)
+    view, _ = match.view(picture.smooth, xy, A, before.which, match.bank(patches))
     evidence = np.column_stack([before.evidence, measured])
-    return Hypotheses(before.place, before.at, before.which, fit.xy, fit.A, view, evidence)
+    return Hypotheses(before.place, before.at, before.which, xy, A, view, evidence)
 
 
 def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
@@ -274,9 +288,13 @@ def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int
 
 
 def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
-    """What a judge looks at: ``view`` (n, 2, 32, 32), the place and the design, and ``evidence`` (n, columns)."""
+    """What a judge looks at: ``view`` (n, 2, 32, 32), the place and the design, and ``evidence`` (n, columns).
+
+    Outside the image there is neither: both are 0.
+    """
     side = match.VIEW_PX
     pair = np.stack([found.view, match.bank(patches).picture[found.which]], axis=1)
+    pair[np.broadcast_to(np.isnan(found.view)[:, None], pair.shape)] = 0
     return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
 
 

@@ -71,3 +71,57 @@ def test_pyramid_levels_share_their_origin():
 def test_short_axis_is_the_smaller_singular_value():
     A = np.random.default_rng(0).normal(size=(50, 2, 2))
     assert match.short_axis(A) == pytest.approx(np.linalg.svd(A, compute_uv=False)[:, 1])
+
+
+def ellipse(A):
+    """The symmetric map of a pose's ellipse: what is known before its rotation."""
+    square, axes = np.linalg.eigh(A @ A.T)
+    return axes @ np.diag(np.sqrt(square)) @ axes.T
+
+
+@settings(deadline=None, max_examples=20)
+@given(number=st.integers(0, len(PATCHES) - 1), first=st.floats(0, 360), second=st.floats(0, 360))
+def test_a_design_is_turned_within_its_ellipse(number, first, second):
+    xy, A = np.array([60.3, 59.6]), turn(first) @ np.diag([24.0, 17.0]) @ turn(second)
+    levels = match.pyramid(picture(number, A, xy))
+    which = np.arange(len(PATCHES))
+    rows, poses = match.turn(levels, np.tile(xy, (4, 1)), np.tile(ellipse(A), (4, 1, 1)), which, KNOWN)
+    assert set(rows) == set(which)
+    assert (poses.which == which[rows]).all()
+    best = poses.ncc.argmax()
+    assert poses.which[best] == number
+    assert poses.ncc[best] > 0.9
+    relative = np.linalg.inv(A) @ poses.A[best]
+    angle = np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
+    half = 180 if PATCHES[number].name == "checker" else 360
+    assert abs((angle + half / 2) % half - half / 2) < 6
+
+
+def test_where_nothing_tells_two_rotations_apart_both_are_given():
+    whole, number, where = KNOWN.whole, 1, np.array([60.0, 60.0])
+    own = np.flatnonzero(whole.turned_which == number)
+    least = own[(whole.turned[own] @ whole.turned[own[0]]).argmin()]  # as unlike the first as can be
+    one, other = (
+        picture(number, 18.0 * turn(np.degrees(whole.turned_angle[n])), where).astype(float) for n in (own[0], least)
+    )
+    xy, A, which = where[None], np.diag([18.0, 18.0])[None], np.array([number])
+    rows, poses = match.turn(match.pyramid((0.5 * one + 0.5 * other).astype(np.uint8)), xy, A, which, KNOWN)
+    assert rows.tolist() == [0, 0]
+    assert poses.ncc[0] - match.AS_LIKELY < poses.ncc[1] <= poses.ncc[0]
+    rows, _ = match.turn(match.pyramid(one.astype(np.uint8)), xy, A, which, KNOWN)
+    assert rows.tolist() == [0]
+
+
+def test_a_view_knows_what_lies_outside_and_takes_its_inks_from_what_does_not():
+    A, which = np.diag([20.0, 16.0])[None], np.array([2])
+    image = picture(2, A[0], np.array([60.0, 60.0]))
+    whole, contrast = match.view(match.pyramid(image), np.array([[60.0, 60.0]]), A, which, KNOWN)
+    part, less = match.view(match.pyramid(image[:, 60:]), np.array([[0.0, 60.0]]), A, which, KNOWN)
+    assert not np.isnan(whole).any()
+    side = match.VIEW_PX
+    assert np.isnan(part.reshape(side, side)[:, : side // 2]).all()
+    assert not np.isnan(part.reshape(side, side)[:, side // 2 + 1 :]).any()
+    assert less[0] == pytest.approx(contrast[0], rel=0.1)
+    away, least = match.view(match.pyramid(image), np.array([[400.0, 60.0]]), A, which, KNOWN)
+    assert np.isnan(away).all()
+    assert least[0] == 2.0

@@ -125,3 +125,23 @@ def test_evidence_has_a_column_for_each_name_and_none_for_no_places():
         odds, corrected = verify.judged("fitted", fitted, PATCHES)
         assert odds.shape == (len(posed),)
         assert corrected.xy.shape == fitted.xy.shape
+
+
+def test_a_clear_patch_is_named_by_its_pixels_however_sure_the_network_is_of_another():
+    image, xy, which = scene()
+    found = examined(image, xy, [0, 0], sure=0.9999)
+    assert found.which[1] == which[1]
+
+
+def test_what_lies_outside_the_image_is_no_evidence():
+    image, xy, which = scene()
+    cut = np.ascontiguousarray(image[:, 38:])  # the first centre lies 2 px inside
+    log_id = np.log(np.full((1, len(PATCHES) + 1), 0.2))
+    found = verify.posed(verify.Picture(cut), xy[:1] - [38, 0], np.array([SURE]), log_id, PATCHES)
+    view = verify.inputs(found, PATCHES)["view"]
+    assert np.isnan(found.view).any()
+    assert not np.isnan(view).any()
+    outside = np.isnan(found.view).reshape(len(found), 1, *view.shape[2:])
+    assert (view[np.broadcast_to(outside, view.shape)] == 0).all()
+    assert (view[:, 1:][~outside] != 0).mean() > 0.9
+    assert which[0] in found.which
