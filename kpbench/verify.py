@@ -89,6 +89,8 @@ SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
 BLOCK = 2**11
 """Places whose surroundings are looked at together: memory does not grow with the image."""
+SMALLEST = 2.4
+"""Short semi-axis, px, under which nothing is reported: there a patch is a speck like any other."""
 FAR = 0.1
 """Short semi-axes that a fit may move a centre: beyond, in blur or noise, where it began is right more often."""
 FAINTEST = 2.0
@@ -166,6 +168,7 @@ def examine(
         found = fitted(picture, corrected[hopeful], patches)
     odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
     best = likeliest(found.place, odds)
+    best = best[_minor(found.A[best]) >= SMALLEST]
     found, odds = found[best], odds[best]
     return Examined(found.place, found.which, found.xy, _minor(found.A), 1 / (1 + np.exp(-odds)))
 
