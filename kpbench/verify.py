@@ -75,13 +75,13 @@ FITTED = (
 
 DOUBT = 3.0
 """Designs whose log-probability by the ID head is further behind the likeliest one's are not tried, ..."""
-SURE = 2.0
+SURE = 3.0
 """... but for places that lie on a patch with these log odds: there all are."""
 TURNED_TWICE = -1.0
 """Log odds from which two rotations of a design are tried where both look alike."""
-EMPTY = -3.5
+EMPTY = -2.5
 """Log odds that an ellipse is a patch under which a place is left."""
-HOPELESS = -4.0
+HOPELESS = -3.0
 """Log odds before the fit under which a hypothesis is not worth one."""
 SECOND = 0.7
 """Weight of the second judge's log odds."""

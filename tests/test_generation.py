@@ -300,3 +300,14 @@ def test_work_in_this_process_leaves_its_threads_as_they_were(tmp_path):
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize(
+    ("radii", "code", "said"), [("5", 2, "expected LEAST:MOST such as 5:80"), ("80:5", 1, "--radius-px is 80:5")]
+)
+def test_bad_radii_are_refused_in_a_line(tmp_path, radii, code, said):
+    out = tmp_path / "set"
+    result = CliRunner().invoke(main, ["synth", "--n", "1", "--radius-px", radii, "--out", str(out)])
+    assert result.exit_code == code
+    assert said in result.output
+    assert not out.exists()
