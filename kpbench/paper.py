@@ -94,6 +94,8 @@ SYNTHETIC = {
     "paper": dict(zip(PAPER_METRICS, (0.950, 0.993, 0.727), strict=True)),
 }
 """Table 2, the synthetic validation set, by ``kpbench synth --deteriorate``: without and with deterioration."""
+SYNTHETIC_PX = (5.0, 80.0)
+"""Least and largest radius, px, of the sets that are set beside it: ``kpbench synth`` as it is."""
 
 
 def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:

@@ -38,9 +38,8 @@ from kpbench.exhibits import (
     taxonomy_charts,
     verdict_table,
 )
-from kpbench.paper import PAPER, SYNTHETIC
+from kpbench.paper import PAPER, SYNTHETIC, SYNTHETIC_PX
 from kpbench.pose import PoseGroup
-from kpbench.scene import Limits
 from kpbench.scoring import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
@@ -142,8 +141,8 @@ def sections(report: Report) -> Iterator[Section]:
         )
     conditions = list(dict.fromkeys(name for run in runs for name in run.conditions))
     known = [PAPER[name] for name in conditions if name in PAPER]
-    deteriorate, radii = str(report.config.get("deteriorate")), list(Limits().radius_px)
-    like_the_papers = deteriorate in SYNTHETIC and report.config.get("limits", {}).get("radius_px", radii) == radii
+    deteriorate, limits = str(report.config.get("deteriorate")), report.config.get("limits", {})
+    like_the_papers = deteriorate in SYNTHETIC and tuple(limits.get("radius_px", SYNTHETIC_PX)) == SYNTHETIC_PX
     if known or like_the_papers:
         tables = [paper_table(runs, table, report.images or "the user's") for table in known]
         if like_the_papers:
