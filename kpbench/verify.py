@@ -192,7 +192,7 @@ def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Floa
         odds, shift, log_map = _network("ellipse", threads).run(None, given)
         parts.append((*moved(block, np.tile(np.eye(2), (len(block), 1, 1)), shift, log_map), _clipped(odds)))
     centre, A, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return centre, A, sure.astype(np.float64)
+    return centre, A, sure
 
 
 def moved(xy: Float, A: Float, shift: NDArray[np.float32], log_map: NDArray[np.float32]) -> tuple[Float, Float]:

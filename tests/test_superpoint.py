@@ -10,9 +10,10 @@ from onnx import TensorProto, helper
 
 from kpbench.design import parse_patch, shipped_patches
 from kpbench.detect import load_detector
-from kpbench.detectors.superpoint import Decoding, SuperPointDetector, decode, pad_to_cells
+from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector, decode, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.runtime import open_session
+from kpbench.scene import Placement, render_scene
 
 PATCHES = shipped_patches()
 
@@ -214,6 +215,18 @@ def test_the_shipped_weights_find_large_clean_patches():
                 right += int(detections.patch_id[distance.argmin()] == k["patch_id"])
     assert found >= 0.75 * truths
     assert right >= 0.75 * found
+
+
+@pytest.mark.parametrize("x", [-2.0, 6.0])
+def test_a_verified_detection_lies_in_the_image(monkeypatch, x):
+    """A place inside leads to the patch's centre, which is reported if it is inside, too."""
+    detect = SmallSuperPointDetector()
+    place = np.array([[max(x, 0.0), 50.0]]), np.array([0.9]), np.full((1, 5), np.log(0.2))
+    monkeypatch.setattr(detect, "candidates", lambda greys: [place])
+    H = np.array([[20.0, 0.0, x], [0.0, 20.0, 50.0], [0.0, 0.0, 1.0]])
+    ground = np.full((100, 100), 120, np.uint8)
+    found = detect(render_scene(ground, [Placement(detect.patches[1], H, 20.0, 230.0)]).image)
+    assert len(found) == (x > 0)
 
 
 def test_a_batch_gives_what_single_images_give(detector):
