@@ -14,8 +14,6 @@ Needs `pip install 'kpbench[train]'`.
 from __future__ import annotations
 
 import argparse
-import io
-import warnings
 import zlib
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
@@ -24,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from small_networks import affine, convolution, exported, log_of_map, one_cycle
 from torch import nn
 from tqdm import tqdm
 
@@ -68,11 +67,6 @@ class Ellipse(nn.Module):
         out = self.body(centred / (centred.square().mean((2, 3), keepdim=True).sqrt() + 2.0))
         xx, yy, xy = out[:, 3] + USUAL, out[:, 4] + USUAL, out[:, 5]
         return out[:, 0], out[:, 1:3], torch.stack([xx, xy, xy, yy], 1).unflatten(1, (2, 2))
-
-
-def convolution(inside: int, outside: int, side: int = 3, stride: int = 1) -> list[nn.Module]:
-    conv = nn.Conv2d(inside, outside, side, stride, side // 2, bias=False)
-    return [conv, nn.BatchNorm2d(outside), nn.ReLU()]
 
 
 class Places(NamedTuple):
@@ -138,17 +132,6 @@ def _explained(at: np.ndarray, keypoints: np.ndarray) -> tuple[np.ndarray, np.nd
     return which, on.any(axis=1), (distance > FAR * keypoints["radius_major"]).all(axis=1)
 
 
-def affine(H: np.ndarray) -> np.ndarray:
-    """Derivatives (n, 2, 2) of homographies (n, 3, 3) at the origin."""
-    return H[:, :2, :2] / H[:, 2:, 2:] - H[:, :2, 2:] @ H[:, 2:, :2] / H[:, 2:, 2:] ** 2
-
-
-def log_of_map(A: np.ndarray) -> np.ndarray:
-    """Logarithms (n, 2, 2) of the symmetric maps that give the same ellipses as A (n, 2, 2)."""
-    square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
-    return np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("datasets", nargs="+")
@@ -177,32 +160,23 @@ def _together(parts: list[Places]) -> list[torch.Tensor]:
     return [torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)]
 
 
-BATCH = 256
-
-
 def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
     """Cross-entropy of the log odds, smooth L1 of shift and log map on patches; AdamW, one cycle of learning rates."""
     torch.manual_seed(0)
     network = Ellipse().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=2e-2)
-    steps = epochs * (len(data[0]) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 3e-3, total_steps=steps)
-    progress = tqdm(total=steps, desc=f"train on {len(data[0])}, {data[1].float().mean():.0%} on patches", leave=False)
-    for _ in range(epochs):
-        for rows in torch.randperm(len(data[0])).split(BATCH)[: len(data[0]) // BATCH]:
-            around, on, shift, log_map = _mirrored(*(column[rows] for column in data))
-            odds, shifted, mapped = network(around * torch.exp(0.2 * torch.randn(len(around), 1, 1, 1)))
-            loss = nn.functional.binary_cross_entropy_with_logits(odds, on.float())
-            loss = loss + 4 * nn.functional.smooth_l1_loss(shifted[on], shift[on], beta=0.03)
-            loss = loss + 3 * nn.functional.smooth_l1_loss(mapped[on], log_map[on], beta=0.05)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            progress.update()
-            progress.set_postfix(loss=f"{loss.item():.3f}", refresh=False)
-    progress.close()
-    return network.eval()
+
+    def loss(rows: torch.Tensor) -> torch.Tensor:
+        around, on, shift, log_map = _mirrored(*(column[rows] for column in data))
+        odds, shifted, mapped = network(around * torch.exp(0.2 * torch.randn(len(around), 1, 1, 1)))
+        return (
+            nn.functional.binary_cross_entropy_with_logits(odds, on.float())
+            + 4 * nn.functional.smooth_l1_loss(shifted[on], shift[on], beta=0.03)
+            + 3 * nn.functional.smooth_l1_loss(mapped[on], log_map[on], beta=0.05)
+        )
+
+    print(f"train on {len(data[0])} places, {data[1].float().mean():.0%} on patches")
+    one_cycle(network, loss, lambda: torch.randperm(len(data[0])), epochs, 256, 3e-3)
+    return network
 
 
 def _mirrored(around: torch.Tensor, on: torch.Tensor, shift: torch.Tensor, log_map: torch.Tensor) -> list[torch.Tensor]:
@@ -238,24 +212,6 @@ def report(network: Ellipse, test: list[torch.Tensor], images: int) -> None:
     for limit in (-6, -5, -4, -3, -2):
         kept, others = float((odds[on] >= limit).float().mean()), int((odds[~on] >= limit).sum()) / images
         print(f"log odds from {limit}: {kept:.4f} of those on patches, {others:.1f} others an image")
-
-
-def exported(network: nn.Module, example: tuple[torch.Tensor, ...], inputs: list[str]) -> bytes:
-    """A network as ONNX, for any number of places: these inputs, outputs ``odds``, ``shift``, ``log_map``."""
-    buffer, outputs = io.BytesIO(), ["odds", "shift", "log_map"]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(
-            network,
-            example,
-            buffer,
-            dynamo=False,
-            opset_version=17,
-            input_names=inputs,
-            output_names=outputs,
-            dynamic_axes={name: {0: "places"} for name in [*inputs, *outputs]},
-        )
-    return buffer.getvalue()
 
 
 if __name__ == "__main__":

@@ -15,14 +15,16 @@ they are, by each judge, and by the mean of both, which is what the detector rep
 from __future__ import annotations
 
 import argparse
+import zlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
-from ellipses import affine, convolution, exported, log_of_map
+from small_networks import affine, convolution, exported, log_of_map, one_cycle
 from torch import nn
 from tqdm import tqdm
 
@@ -96,10 +98,9 @@ def start(model: str | None) -> None:
     _detector = SuperPointDetector(Path(model)) if model else SmallSuperPointDetector()
 
 
-def look(path: str, n: int) -> Looked:
+def look(path: str, strewn: bool, n: int) -> Looked:
     """Candidates of one image, posed."""
-    image, keypoints = kpbench.open_dataset(path)[n]
-    grey = to_grey(image)
+    grey, keypoints = shown(path, strewn, n)
     xy, score, log_id = _detector.candidates([grey])[0]
     ids = np.array([patch.patch_id for patch in _detector.patches])[log_id[:, :-1].argmax(axis=1)]
     right = explains(xy, ids, keypoints, 0.1)
@@ -111,10 +112,28 @@ def _small(found: verify.Hypotheses) -> verify.Hypotheses:
     return replace(found, view=found.view.astype(np.float16))
 
 
-def fit(path: str, n: int, posed: verify.Hypotheses) -> verify.Hypotheses:
+def fit(path: str, strewn: bool, n: int, posed: verify.Hypotheses) -> verify.Hypotheses:
     """Hypotheses of one image, fitted."""
-    picture = Picture(to_grey(kpbench.open_dataset(path).image(n)))
-    return _small(verify.fitted(picture, posed, _detector.patches))
+    return _small(verify.fitted(Picture(shown(path, strewn, n)[0]), posed, _detector.patches))
+
+
+def shown(path: str, strewn: bool, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """One image of a set, grey, and its keypoints; of a strewn set every third one has specks beside its patches.
+
+    Specks, of 1 to 6 px, are hot pixels, dust, and leaves and windows far away: what a small patch looks most like.
+    """
+    image, keypoints = kpbench.open_dataset(path)[n]
+    grey = to_grey(image).copy()
+    if not strewn or n % 3:
+        return grey, keypoints
+    rng = np.random.default_rng([zlib.crc32(Path(path).name.encode()), n])
+    at = rng.uniform(0, grey.shape[::-1], (rng.integers(1, 40) * grey.size // 200_000, 2))
+    away = np.hypot(at[:, :1] - keypoints["x"], at[:, 1:] - keypoints["y"]) > keypoints["radius_major"] + 4
+    for x, y in np.rint(16 * at[away.all(axis=1)]).astype(int).tolist():
+        axes = np.rint(16 * rng.uniform(0.4, 3.0, 2)).astype(int).tolist()
+        level = float(rng.choice([0, 255, rng.integers(256)]))
+        cv2.ellipse(grey, (x, y), axes, float(rng.uniform(0, 180)), 0, 360, level, -1, cv2.LINE_AA, 4)
+    return grey, keypoints
 
 
 def explains(xy: np.ndarray, ids: np.ndarray, keypoints: np.ndarray, tolerance: float) -> np.ndarray:
@@ -139,7 +158,7 @@ def main() -> None:
     paths = [*options.datasets, options.test]
     with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model,)) as pool:
         sets = [
-            list(tqdm(pool.map(partial(look, path), range(count)), f"look {path}", count, leave=False))
+            list(tqdm(pool.map(partial(look, path, path != options.test), range(count)), f"look {path}", count))
             for path in paths
             for count in [len(kpbench.open_dataset(path))]
         ]
@@ -153,7 +172,9 @@ def main() -> None:
             for one in part:
                 chosen = verify.distinct(one.corrected, one.odds, least)
                 one.odds, one.corrected = one.odds[chosen], one.corrected[chosen]
-            found = pool.map(partial(fit, path), range(len(part)), [one.corrected for one in part])
+            found = pool.map(
+                partial(fit, path, part is not sets[-1]), range(len(part)), [one.corrected for one in part]
+            )
             for one, after in zip(part, tqdm(found, f"fit {path}", len(part), leave=False), strict=True):
                 one.fitted = after
     after = trained([one.fitted for one in training], [one.keypoints for one in training], 0.1, 16, options.epochs)
@@ -174,41 +195,36 @@ def trained(
 ) -> Judge:
     """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate."""
     torch.manual_seed(0)
-    right = [right_ones(f, t, tolerance) for f, t in zip(found, truths, strict=True)]
-    known = np.concatenate(right)
-    # before the fit nearly all are wrong: some of them, with more weight, stand for all
-    share, rng = min(1.0, 3 * known.mean() / (1 - known).mean()), np.random.default_rng(0)
-    kept = [np.flatnonzero(r | (rng.random(len(r)) < share)) for r in right]
-    tensors = [_tensors(f[k]) for f, k in zip(found, kept, strict=True) if len(k)]
-    view, evidence = (torch.cat(parts) for parts in zip(*tensors, strict=True))
-    off = [errors(f[k], t) for f, k, t in zip(found, kept, truths, strict=True)]
+    rng = np.random.default_rng(0)
+    whole = verify.Hypotheses(*map(np.concatenate, zip(*(vars(one).values() for one in found), strict=True)))
+    right = np.concatenate([right_ones(f, t, tolerance) for f, t in zip(found, truths, strict=True)])
+    off = [errors(f, t) for f, t in zip(found, truths, strict=True)]
     near, shift, log_map = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*off, strict=True))
-    shift, log_map = shift.float(), log_map.float()
-    target = torch.from_numpy(np.concatenate([r[k] for r, k in zip(right, kept, strict=True)])).float()
+    target, shift, log_map = torch.from_numpy(right).float(), shift.float(), log_map.float()
+    own, other = np.flatnonzero(right), np.flatnonzero(~right)
+    # before the fit nearly all are wrong: some of them, others in every epoch and with more weight, stand for all
+    share = min(1.0, 3 * len(own) / len(other))
     weight = torch.where(target > 0, 1.0, 1 / share)
-    judge = Judge(evidence.numpy(), width)
-    optimizer = torch.optim.AdamW(judge.parameters(), weight_decay=2e-2)
-    steps = epochs * (len(target) // BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 2e-3, total_steps=steps)
-    progress = tqdm(total=steps, desc=f"train on {len(target)}, {known.mean():.0%} right", leave=False)
-    for _ in range(epochs):
-        for rows in torch.randperm(len(target)).split(BATCH)[: len(target) // BATCH]:
-            logit, shifted, mapped = judge(_disturbed(view[rows]), evidence[rows])
-            loss = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
-            if (own := near[rows]).any():
-                loss = loss + nn.functional.smooth_l1_loss(shifted[own], shift[rows][own], beta=0.02)
-                loss = loss + nn.functional.smooth_l1_loss(mapped[own], log_map[rows][own], beta=0.05)
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            schedule.step()
-            progress.update()
-            progress.set_postfix(loss=f"{loss.item():.3f}", refresh=False)
-    progress.close()
-    return judge.eval()
 
+    def drawn() -> torch.Tensor:
+        return torch.from_numpy(
+            rng.permutation(np.concatenate([own, rng.permutation(other)[: int(share * len(other))]]))
+        )
 
-BATCH = 128
+    judge = Judge(whole.evidence[drawn()], width).to(memory_format=torch.channels_last)
+
+    def loss(rows: torch.Tensor) -> torch.Tensor:
+        view, evidence = _tensors(whole[rows.numpy()])
+        logit, shifted, mapped = judge(_disturbed(view), evidence)
+        value = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
+        if (at := near[rows]).any():
+            value = value + nn.functional.smooth_l1_loss(shifted[at], shift[rows][at], beta=0.02)
+            value = value + nn.functional.smooth_l1_loss(mapped[at], log_map[rows][at], beta=0.05)
+        return value
+
+    print(f"train on {len(right)} hypotheses, {right.mean():.0%} right")
+    one_cycle(judge, loss, drawn, epochs, 128, 2e-3)
+    return judge
 
 
 def _tensors(found: verify.Hypotheses) -> tuple[torch.Tensor, torch.Tensor]:

@@ -127,7 +127,7 @@ def test_bad_input_is_one_line_and_exit_code_1(arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--measured", "100"), "is no pair of lengths, expected X_MM,Y_MM"),
+        (("--measured", "100"), "is not X_MM,Y_MM, expected two numbers"),
         (("--measured", "100,100", "--pdf"), "takes no other option"),
         (("--tile",), "give --board"),
         (("--board", "grid", "--copies", 2), "not for a --board"),

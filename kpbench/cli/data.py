@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from kpbench.cli.options import PATCHES, SEED, SIZE, Pair, run_options
+from kpbench.cli.options import PATCHES, SEED, SIZE, Two, run_options
 
 __all__ = ["export", "inspect", "merge", "preview", "synth", "verify"]
 
@@ -37,7 +37,7 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 )
 @click.option(
     "--radius-px",
-    type=Pair(),
+    type=Two(float, "LEAST:MOST", ":", "5:80"),
     default="5:80",
     show_default=True,
     help="Of the discs before tilt. No short semi-axis is under the least of them or 5 px, whichever is less.",

@@ -5,26 +5,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import click
 
-__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Pair", "Size", "run_options"]
+__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Two", "run_options"]
 
 
-class Size(click.ParamType[tuple[int, int]]):
-    """``WIDTHxHEIGHT`` in px, as a tuple."""
+Number = TypeVar("Number", bound=float)
 
-    name = "WxH"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+class Two(click.ParamType[tuple[Number, Number]], Generic[Number]):
+    """Two numbers with a separator between them, as a tuple."""
+
+    def __init__(self, kind: type[Number], name: str, separator: str, example: str) -> None:
+        self.kind, self.name, self.separator, self.example = kind, name, separator, example
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[Number, Number]:
         if isinstance(value, tuple):
             return value
         try:
-            width, height = (int(part) for part in str(value).lower().split("x"))
+            first, second = map(self.kind, str(value).lower().split(self.separator))
         except ValueError:
-            self.fail(f"{value!r} is no size, expected WIDTHxHEIGHT such as 640x480", param, ctx)
-        return width, height
+            self.fail(f"{value!r} is not {self.name}, expected two numbers such as {self.example}", param, ctx)
+        return first, second
 
 
 class Names(click.ParamType[tuple[str, ...]]):
@@ -49,35 +53,8 @@ class Finite(click.FloatRange):
         return number
 
 
-class Span(click.ParamType[range]):
-    """``A:B`` as a range."""
-
-    name = "A:B"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> range:
-        try:
-            first, last = (int(part) for part in str(value).split(":"))
-        except ValueError:
-            self.fail(f"{value!r} is no range, expected A:B such as 0:10", param, ctx)
-        return range(first, last)
-
-
-class Pair(click.ParamType[tuple[float, float]]):
-    """``LEAST:MOST`` as a tuple of numbers."""
-
-    name = "LEAST:MOST"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        if isinstance(value, tuple):
-            return value
-        try:
-            least, most = (float(part) for part in str(value).split(":"))
-        except ValueError:
-            self.fail(f"{value!r} is no pair, expected LEAST:MOST such as 5:80", param, ctx)
-        return least, most
-
-
-SIZE = Size()
+SIZE = Two(int, "WxH", "x", "640x480")
+SHARDS = Two(int, "A:B", ":", "0:10")
 FINITE = Finite()
 ONLY = click.option("--only", type=Names(), default="", help="Only these conditions, such as scale,blur.")
 SEED = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
@@ -97,7 +74,7 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
         WORKERS,
         click.option("--engine", type=click.Choice(["local", "dask"]), default="local", show_default=True),
         click.option("--scheduler", metavar="ADDR", help="Of Dask, such as tcp://host:8786."),
-        click.option("--shard-range", type=Span(), help="Only these shards, from 0; put together by kpbench merge."),
+        click.option("--shard-range", type=SHARDS, help="Only these shards, from 0; put together by kpbench merge."),
         click.option("--resume", is_flag=True, help="Finish an interrupted run."),
         click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder."),
     )):  # fmt: skip

@@ -7,20 +7,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.options import Finite
-
-
-class Measured(click.ParamType[tuple[float, float]]):
-    """``X_MM,Y_MM`` as a tuple."""
-
-    name = "X_MM,Y_MM"
-
-    def convert(self, value: object, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        try:
-            x, y = (float(part) for part in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is no pair of lengths, expected X_MM,Y_MM such as 99.8,100.1", param, ctx)
-        return x, y
+from kpbench.cli.options import Finite, Two
 
 
 @click.command("render-patches")
@@ -53,7 +40,7 @@ class Measured(click.ParamType[tuple[float, float]]):
 @click.option("--no-labels", is_flag=True, help="No text; rulers and cut marks stay.")
 @click.option(
     "--measured",
-    type=Measured(),
+    type=Two(float, "X_MM,Y_MM", ",", "99.8,100.1"),
     help="Lengths of the two rulers on the paper: corrects the sidecars in --out, prints nothing anew.",
 )
 @click.pass_context

@@ -38,7 +38,7 @@ def write_dataset(
     workers: int | None,
     engine: str,
     scheduler: str | None,
-    shard_range: range | None,
+    shard_range: tuple[int, int] | None,
     resume: bool,
     overwrite: bool,
 ) -> None:
@@ -47,7 +47,8 @@ def write_dataset(
         raise click.UsageError("--resume and --overwrite exclude each other")
     if (engine == "dask") != (scheduler is not None):
         raise click.UsageError("--engine dask and --scheduler ADDR belong together")
-    total = recipe.n if shard_range is None else min(len(shard_range) * recipe.shard_size, recipe.n)
+    part = range(*shard_range) if shard_range else None
+    total = recipe.n if part is None else min(len(part) * recipe.shard_size, recipe.n)
     how: dict[str, Any] = {"workers": workers, "resume": resume, "overwrite": overwrite}
     try:
         with (
@@ -55,9 +56,9 @@ def write_dataset(
             progress_bar(total, what) as progress,
         ):
             how |= {"executor": executor, "progress": progress}
-            if shard_range is not None:
-                images = generate_part(recipe, out, shard_range, **how)
-                click.echo(f"{out}: {images} images in shards {shard_range.start}:{shard_range.stop}; no manifest yet")
+            if part is not None:
+                images = generate_part(recipe, out, part, **how)
+                click.echo(f"{out}: {images} images in shards {part.start}:{part.stop}; no manifest yet")
                 return
             run = generate(recipe, out, **how)
     except KeyboardInterrupt:
