@@ -29,12 +29,12 @@ Float32 = NDArray[np.float32]
 MOST_KEYPOINTS = 12
 IMAGE_PX = (640, 480)  # the image that a crop is thought to be cut from: focal lengths are relative to it
 ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
-VIEWS = {1.0: 0.5, 1.5: 0.35, 0.5: 0.15}
+VIEWS = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
 """Scales at which a crop's image is shown, and how often each comes."""
-VIEW_RADIUS_PX = (5.0, 40.0)
+VIEW_RADIUS_PX = (4.0, 40.0)
 """Radii at the scale 1.5, where what is large is left to the other scales; px of the image itself."""
-DETECTABLE = 15.0
-"""Least contrast / noise · √area of a keypoint that is asked for: 7.5 sigma at the output of a matched filter."""
+DETECTABLE = 12.0
+"""Least contrast / noise · √area of a keypoint that is asked for: 6 sigma at the output of a matched filter."""
 FAINTEST = 4.0
 """Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of anything fainter."""
 
@@ -76,7 +76,7 @@ def make_crops(
         image = _background(photos, rng, round(width / scale), round(height / scale))
         if rng.random() < 0.5:
             draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
-        drawn = _lay_out(rng, patches, image, Limits(radius_px=VIEW_RADIUS_PX) if scale > 1 else Limits())
+        drawn = _lay_out(rng, patches, image, Limits.of_radius(*VIEW_RADIUS_PX) if scale > 1 else Limits())
         discs.append(drawn)
         canvases.append(image)
     _paint_all(canvases, discs)
@@ -275,9 +275,12 @@ def _degrade(
 
 
 def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """A shadow with one straight border, sharp or soft; now and then a glare instead."""
+    """A shadow with one straight border, sharp or soft; now and then a glare, or jagged shadows with many borders."""
     height, width = work.shape
-    if rng.random() < 0.15:
+    kind = rng.random()
+    if kind < 0.3:
+        return _jagged(work, rng)
+    if kind < 0.4:
         x = (np.arange(width, dtype=np.float32) - np.float32(rng.uniform(0, width))) / np.float32(rng.uniform(8, width))
         y = (np.arange(height, dtype=np.float32) - np.float32(rng.uniform(0, height))) / np.float32(
             rng.uniform(8, height)
@@ -290,6 +293,18 @@ def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
     ramp = np.clip((y[:, None] + x) / np.float32(np.exp(rng.uniform(0, np.log(width)))) + 0.5, 0, 1)
     factor = rng.uniform(0.2, 0.9)
     return np.asarray(work * (1 - np.float32(1 - factor) * ramp), np.float32), factor
+
+
+def _jagged(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
+    """One or two shadows of five corners anywhere in and around the crop, their sides crossing each other."""
+    height, width = work.shape
+    light, least = np.ones_like(work), 1.0
+    for _ in range(rng.integers(1, 3)):
+        corners = np.rint(rng.uniform(-1.0, 2.0, (5, 2)) * (width, height)).astype(np.int32)
+        factor = float(rng.uniform(0.3, 0.8))
+        light *= np.where(cv2.fillPoly(np.zeros(work.shape, np.uint8), [corners], 1) > 0, np.float32(factor), 1)
+        least *= factor
+    return work * light, least
 
 
 def _rain(work: Float32, rng: np.random.Generator) -> Float32:

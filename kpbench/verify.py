@@ -85,6 +85,8 @@ HOPELESS = -3.0
 """Log odds before the fit under which a hypothesis is not worth one."""
 SECOND = 0.7
 """Weight of the second judge's log odds."""
+USUAL = 60
+"""Places asked about in an image that the judges were trained on, on average: their odds hold for as many."""
 SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
 BLOCK = 2**11
@@ -167,6 +169,8 @@ def examine(
         hopeful = distinct(corrected, odds)
         found = fitted(picture, corrected[hopeful], patches)
     odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
+    # an image has so many patches, however many places it has that look like one
+    odds = odds - np.log(max(1.0, len(xy) / USUAL))
     best = likeliest(found.place, odds)
     best = best[_minor(found.A[best]) >= SMALLEST]
     found, odds = found[best], odds[best]

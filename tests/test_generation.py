@@ -303,7 +303,8 @@ def test_work_in_this_process_leaves_its_threads_as_they_were(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("radii", "code", "said"), [("5", 2, "is not LEAST:MOST, expected two numbers such as 5:80"), ("80:5", 1, "--radius-px is 80:5")]
+    ("radii", "code", "said"),
+    [("5", 2, "is not LEAST:MOST, expected two numbers such as 5:80"), ("80:5", 1, "--radius-px is 80:5")],
 )
 def test_bad_radii_are_refused_in_a_line(tmp_path, radii, code, said):
     out = tmp_path / "set"

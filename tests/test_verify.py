@@ -52,6 +52,15 @@ def test_a_place_beside_the_centre_leads_to_it():
     np.testing.assert_allclose(found.xy, xy[:1], atol=0.02)
 
 
+def test_where_more_places_look_like_a_patch_each_is_less_likely_one():
+    image, xy, which = scene()
+    few = examined(image, xy, which)
+    bare = np.tile([[5.0, 5.0]], (2 * verify.USUAL, 1))
+    many = examined(image, np.concatenate([xy, bare]), which + [0] * len(bare))
+    odds = [np.log(found.score / (1 - found.score)) for found in (few, many)]
+    np.testing.assert_allclose(odds[0] - odds[1], np.log(2 + 2 / verify.USUAL), atol=1e-3)
+
+
 def test_bare_ground_is_nothing_whatever_the_network_says():
     assert len(examined(np.full((64, 64), 120, np.uint8), [[20.0, 30.0]], [0]).score) == 0
 
