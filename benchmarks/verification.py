@@ -163,7 +163,7 @@ def main() -> None:
             for count in [len(kpbench.open_dataset(path))]
         ]
         training = [one for part in sets[:-1] for one in part]
-        before = trained([one.posed for one in training], [one.keypoints for one in training], 0.2, 8, options.epochs)
+        before = trained([one.posed for one in training], [one.keypoints for one in training], 0.2, 12, options.epochs)
         for path, part in zip(paths, sets, strict=True):
             for one in part:
                 one.odds, one.corrected = judged(before, one.posed)
@@ -196,7 +196,7 @@ def trained(
     """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate."""
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    whole = verify.Hypotheses(*map(np.concatenate, zip(*(vars(one).values() for one in found), strict=True)))
+    whole = verify.Hypotheses.joined(found)
     right = np.concatenate([right_ones(f, t, tolerance) for f, t in zip(found, truths, strict=True)])
     off = [errors(f, t) for f, t in zip(found, truths, strict=True)]
     near, shift, log_map = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*off, strict=True))

@@ -55,6 +55,8 @@ TURNS = 72
 """Rotations of the whole design that are tried: to within 2.5 degrees, where a fit can start."""
 AS_LIKELY, UNLIKE = 0.15, 0.5
 """How much less a second rotation may correlate with the image, and how little it must with the best one."""
+SIZES = (0.8, 0.9, 1.1)
+"""Other sizes of an ellipse in which its design is turned: rings, and what lies around, make it too large or small."""
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 WHOLE_PX = 5.6
@@ -324,7 +326,7 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
 def turn(
     levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Bank, twice: NDArray[np.bool_] | None = None
 ) -> tuple[Ints, Poses]:
-    """The likely rotations of a design within an ellipse: the best, and a second one that looks as likely.
+    """The best rotation of a design within an ellipse, or one of another size, and a second one that looks as likely.
 
     Parameters
     ----------
@@ -332,27 +334,37 @@ def turn(
     xy, A : (N, 2), (N, 2, 2) px; the ellipse is the image of the unit circle.
     which : (N,) index of the design.
     known : the designs.
-    twice : (N,) where a second one is wanted; None: everywhere.
+    twice : (N,) where other sizes and a second rotation are tried; None: everywhere.
 
     Returns
     -------
     Rows (M,) from 0 to N - 1, in order and each once or twice, and their poses.
     """
-    whole = known.whole
+    whole, again = known.whole, np.arange(len(xy)) if twice is None else np.flatnonzero(twice)
+    ncc, found = _turns(levels, xy, A, which, whole), A.copy()
+    for size in SIZES:
+        other = _turns(levels, xy[again], size * A[again], which[again], whole)
+        better = other.max(axis=1) > ncc[again].max(axis=1)
+        ncc[again[better]], found[again[better]] = other[better], size * A[again[better]]
+    first, every = ncc.argmax(axis=1), np.arange(len(xy))
+    unlike = whole.turned @ whole.turned.T < UNLIKE
+    second = np.where(unlike[first], ncc, -np.inf).argmax(axis=1)
+    as_likely = unlike[first, second] & (ncc[every, second] > ncc[every, first] - AS_LIKELY)
+    again = again[as_likely[again]]
+    row = np.concatenate([every, again])
+    order = np.argsort(row, kind="stable")
+    row, turned = row[order], np.concatenate([first, second[again]])[order]
+    return row, _turned(xy[row], found[row], which[row], turned, ncc[row], whole)
+
+
+def _turns(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, whole: Templates) -> Float32:
+    """Correlations (N, R) of ellipses with all rotations; -inf for those of other designs than ``which``."""
     values = _sample(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, whole.points)
     ncc = _normalise(values) @ whole.turned.T
     cut, outside = _outside(levels[0], xy, A, whole.points)
     ncc[cut] = _partial_ncc(values[cut], ~outside, whole.turned)
     ncc[whole.turned_which != which[:, None]] = -np.inf
-    first, every = ncc.argmax(axis=1), np.arange(len(xy))
-    unlike = whole.turned @ whole.turned.T < UNLIKE
-    second = np.where(unlike[first], ncc, -np.inf).argmax(axis=1)
-    as_likely = unlike[first, second] & (ncc[every, second] > ncc[every, first] - AS_LIKELY)
-    again = np.flatnonzero(as_likely if twice is None else as_likely & twice)
-    row = np.concatenate([every, again])
-    order = np.argsort(row, kind="stable")
-    row, turned = row[order], np.concatenate([first, second[again]])[order]
-    return row, _turned(xy[row], A[row], which[row], turned, ncc[row], whole)
+    return ncc
 
 
 def _turned(xy: Float, A: Float, which: Ints, turned: Ints, ncc: Float32, templates: Templates) -> Poses:

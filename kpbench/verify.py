@@ -78,7 +78,7 @@ DOUBT = 3.0
 SURE = 3.0
 """... but for places that lie on a patch with these log odds: there all are."""
 TURNED_TWICE = -1.0
-"""Log odds from which two rotations of a design are tried where both look alike."""
+"""Log odds from which more sizes of a design, and two rotations where both look alike, are tried."""
 EMPTY = -2.5
 """Log odds that an ellipse is a patch under which a place is left."""
 HOPELESS = -3.0
@@ -126,6 +126,11 @@ class Hypotheses:
 
     def __getitem__(self, keep: Any) -> Hypotheses:
         return Hypotheses(*(column[keep] for column in vars(self).values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Hypotheses]) -> Hypotheses:
+        """Those of all parts, one after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
 @dataclass(frozen=True)
@@ -306,8 +311,9 @@ def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.
 
 
 def version() -> str:
-    """Which networks these are: the first digits of the SHA-256 of their weights."""
-    return hashlib.sha256(b"".join(map(_weights, ("ellipse", "posed", "fitted")))).hexdigest()[:8]
+    """Which networks these are and which code asks them: the first digits of the SHA-256 of both."""
+    code = (Path(str(module)).read_bytes() for module in (__file__, match.__file__, refine.__file__))
+    return hashlib.sha256(b"".join([*map(_weights, ("ellipse", "posed", "fitted")), *code])).hexdigest()[:8]
 
 
 def _weights(name: str) -> bytes:

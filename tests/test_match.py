@@ -97,6 +97,17 @@ def test_a_design_is_turned_within_its_ellipse(number, first, second):
     assert abs((angle + half / 2) % half - half / 2) < 6
 
 
+@pytest.mark.parametrize("number", range(len(PATCHES)))
+def test_an_ellipse_that_is_a_fifth_too_large_still_gives_the_design(number):
+    xy, A = np.array([[60.0, 60.0]]), np.diag([24.0, 17.0])
+    levels, which = match.pyramid(picture(number, A, xy[0])), np.array([number])
+    for size in (1.0, 1.2):
+        rows, poses = match.turn(levels, xy, size * A[None], which, KNOWN)
+        assert poses.ncc[0] > 0.85
+    rows, poses = match.turn(levels, xy, 1.2 * A[None], which, KNOWN, np.array([False]))
+    assert poses.A[0] @ poses.A[0].T == pytest.approx((1.2 * A) @ (1.2 * A).T)
+
+
 def test_where_nothing_tells_two_rotations_apart_both_are_given():
     whole, number, where = KNOWN.whole, 1, np.array([60.0, 60.0])
     own = np.flatnonzero(whole.turned_which == number)

@@ -159,9 +159,9 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
-CANDIDATE = 0.03
+CANDIDATE = 0.02
 """Least score of the network from which a place is worth verifying."""
-SCALES = (1.5, 0.5)
+SCALES = (1.5, 0.6, 0.25)
 """Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
 SAME_PX = 3.0
 """Candidates of two scales that are nearer to each other than this are one."""
