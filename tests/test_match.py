@@ -102,9 +102,9 @@ def test_an_ellipse_that_is_a_fifth_too_large_still_gives_the_design(number):
     xy, A = np.array([[60.0, 60.0]]), np.diag([24.0, 17.0])
     levels, which = match.pyramid(picture(number, A, xy[0])), np.array([number])
     for size in (1.0, 1.2):
-        rows, poses = match.turn(levels, xy, size * A[None], which, KNOWN)
+        _, poses = match.turn(levels, xy, size * A[None], which, KNOWN)
         assert poses.ncc[0] > 0.85
-    rows, poses = match.turn(levels, xy, 1.2 * A[None], which, KNOWN, np.array([False]))
+    _, poses = match.turn(levels, xy, 1.2 * A[None], which, KNOWN, np.array([False]))
     assert poses.A[0] @ poses.A[0].T == pytest.approx((1.2 * A) @ (1.2 * A).T)
 
 
