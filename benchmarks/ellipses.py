@@ -151,8 +151,8 @@ def main() -> None:
     report(network, _together(test), count)
     if options.write:
         target = Path(verify.__file__).parent / "weights" / "ellipse.onnx"
-        example = torch.zeros(2, match.OCTAVES, match.VIEW_PX, match.VIEW_PX)
-        target.write_bytes(exported(network, (example,), ["surroundings"]))
+        seen = [(some.float(),) for some in _together(test)[0][:4096].split(64)]
+        target.write_bytes(exported(network, seen, ["surroundings"]))
         print(f"{target.name}: {target.stat().st_size} bytes")
 
 

@@ -7,9 +7,12 @@ import warnings
 from collections.abc import Callable
 
 import numpy as np
+import onnx
 import torch
 from torch import nn
 from tqdm import tqdm
+
+from kpbench.export import quantise
 
 
 def convolution(inside: int, outside: int, side: int = 3, stride: int = 1) -> list[nn.Module]:
@@ -45,14 +48,17 @@ def one_cycle(
     network.eval()
 
 
-def exported(network: nn.Module, example: tuple[torch.Tensor, ...], inputs: list[str]) -> bytes:
-    """A network as ONNX, for any number of places: these inputs, outputs ``odds``, ``shift``, ``log_map``."""
+def exported(network: nn.Module, seen: list[tuple[torch.Tensor, ...]], inputs: list[str]) -> bytes:
+    """A network as ONNX, for any number of places: these inputs, outputs ``odds``, ``shift``, ``log_map``.
+
+    In 8-bit integers, whose ranges are those of some inputs that the network has ``seen``.
+    """
     buffer, outputs = io.BytesIO(), ["odds", "shift", "log_map"]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             network,
-            example,
+            seen[0],
             buffer,
             dynamo=False,
             opset_version=17,
@@ -60,7 +66,8 @@ def exported(network: nn.Module, example: tuple[torch.Tensor, ...], inputs: list
             output_names=outputs,
             dynamic_axes={name: {0: "places"} for name in [*inputs, *outputs]},
         )
-    return buffer.getvalue()
+    feeds = (dict(zip(inputs, (part.numpy() for part in one), strict=True)) for one in seen)
+    return bytes(quantise(onnx.load_from_string(buffer.getvalue()), feeds).SerializeToString())
 
 
 def affine(H: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ Two judges, one before the fit and one after it, of the same small network. Befo
 centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth; of two
 rotations at one place the better one is. Each also
 learns by how much the pose of a hypothesis of the right design is off, if that is less than half a radius.
+What the first one is to see at its second look is what the shipped one makes of the first look.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
 they are, by each judge, and by the mean of both, which is what the detector reports. `--write` replaces
 `posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
@@ -35,6 +36,8 @@ from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, Supe
 from kpbench.match import VIEW_PX, Picture, bank, short_axis
 from kpbench.workers import cores, one_thread
 
+MORE = 2.0
+"""Log odds by which more hypotheses than in :func:`kpbench.verify.examine` are looked at again and fitted, to train."""
 RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 
 
@@ -81,21 +84,32 @@ class Looked:
     score: np.ndarray
     right: np.ndarray
     posed: verify.Hypotheses
-    odds: np.ndarray | None = None
-    """By the first judge."""
-    corrected: verify.Hypotheses | None = None
-    """The posed ones, as the first judge would have them."""
-    fitted: verify.Hypotheses | None = None
+    again: verify.Hypotheses
+    """The posed ones, as the shipped judge would have them."""
+
+
+@dataclass
+class Fitted:
+    """What the first judge makes of one image, and what the fit makes of that."""
+
+    odds: np.ndarray
+    """By the first judge, at its second look."""
+    corrected: verify.Hypotheses
+    fitted: verify.Hypotheses
 
 
 _detector: SuperPointDetector
+_judge: Judge
 
 
-def start(model: str | None) -> None:
+def start(model: str | None, judge: Judge | None = None) -> None:
     """What each worker process keeps."""
-    global _detector
+    global _detector, _judge
     one_thread()
     _detector = SuperPointDetector(Path(model)) if model else SmallSuperPointDetector()
+    if judge is not None:
+        torch.set_num_threads(1)
+        _judge = judge
 
 
 def look(path: str, strewn: bool, n: int) -> Looked:
@@ -104,7 +118,11 @@ def look(path: str, strewn: bool, n: int) -> Looked:
     xy, score, log_id = _detector.candidates([grey])[0]
     ids = np.array([patch.patch_id for patch in _detector.patches])[log_id[:, :-1].argmax(axis=1)]
     right = explains(xy, ids, keypoints, 0.1)
-    return Looked(keypoints, score, right, _small(verify.posed(Picture(grey), xy, score, log_id, _detector.patches)))
+    picture = Picture(grey)
+    posed = verify.posed(picture, xy, score, log_id, _detector.patches)
+    odds, corrected = verify.judged("posed", posed, _detector.patches)
+    again = verify.again(picture, corrected[odds >= verify.DIM - MORE], _detector.patches)
+    return Looked(keypoints, score, right, _small(posed), _small(again))
 
 
 def _small(found: verify.Hypotheses) -> verify.Hypotheses:
@@ -112,9 +130,17 @@ def _small(found: verify.Hypotheses) -> verify.Hypotheses:
     return replace(found, view=found.view.astype(np.float16))
 
 
-def fit(path: str, strewn: bool, n: int, posed: verify.Hypotheses) -> verify.Hypotheses:
-    """Hypotheses of one image, fitted."""
-    return _small(verify.fitted(Picture(shown(path, strewn, n)[0]), posed, _detector.patches))
+def fit(path: str, strewn: bool, n: int, posed: verify.Hypotheses) -> Fitted:
+    """Hypotheses of one image, judged twice and fitted.
+
+    What it was trained on the first judge knows too well: of that, more is left for the second.
+    """
+    picture, more = Picture(shown(path, strewn, n)[0]), MORE if strewn else 0.0
+    odds, corrected = judged(_judge, posed)
+    odds, corrected = judged(_judge, verify.again(picture, corrected[odds >= verify.DIM - more], _detector.patches))
+    chosen = verify.distinct(corrected, odds, verify.HOPELESS - more)
+    odds, corrected = odds[chosen], corrected[chosen]
+    return Fitted(odds, _small(corrected), _small(verify.fitted(picture, corrected, _detector.patches)))
 
 
 def shown(path: str, strewn: bool, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -162,27 +188,21 @@ def main() -> None:
             for path in paths
             for count in [len(kpbench.open_dataset(path))]
         ]
-        training = [one for part in sets[:-1] for one in part]
-        before = trained([one.posed for one in training], [one.keypoints for one in training], 0.2, 12, options.epochs)
+    seen = [one for part in sets[:-1] for one in part]
+    truths = [one.keypoints for one in seen]
+    before = trained([one.posed for one in seen] + [one.again for one in seen], 2 * truths, 0.2, 16, options.epochs)
+    fits = []
+    with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model, before)) as pool:
         for path, part in zip(paths, sets, strict=True):
-            for one in part:
-                one.odds, one.corrected = judged(before, one.posed)
-            # what it was trained on the first judge knows too well: of that, more is left for the second
-            least = verify.HOPELESS - (2.0 if part is not sets[-1] else 0.0)
-            for one in part:
-                chosen = verify.distinct(one.corrected, one.odds, least)
-                one.odds, one.corrected = one.odds[chosen], one.corrected[chosen]
-            found = pool.map(
-                partial(fit, path, part is not sets[-1]), range(len(part)), [one.corrected for one in part]
-            )
-            for one, after in zip(part, tqdm(found, f"fit {path}", len(part), leave=False), strict=True):
-                one.fitted = after
-    after = trained([one.fitted for one in training], [one.keypoints for one in training], 0.1, 16, options.epochs)
-    report(sets[-1], after)
+            found = pool.map(partial(fit, path, path != options.test), range(len(part)), [one.posed for one in part])
+            fits.append(list(tqdm(found, f"fit {path}", len(part))))
+    after = trained([one.fitted for part in fits[:-1] for one in part], truths, 0.1, 16, options.epochs)
+    report(sets[-1], fits[-1], after)
     if options.write:
-        for name, judge in (("posed", before), ("fitted", after)):
+        seen = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]
+        for name, judge, found in zip(("posed", "fitted"), (before, after), seen, strict=True):
             target = Path(verify.__file__).parent / "weights" / f"{name}.onnx"
-            target.write_bytes(to_onnx(judge))
+            target.write_bytes(to_onnx(judge, found))
             print(f"{target.name}: {target.stat().st_size} bytes")
 
 
@@ -294,17 +314,19 @@ def judged(judge: Judge, found: verify.Hypotheses) -> tuple[np.ndarray, verify.H
     return odds.astype(np.float64), replace(found, xy=xy, A=A)
 
 
-def report(test: list[Looked], after: Judge) -> None:
+def report(test: list[Looked], fits: list[Fitted], after: Judge) -> None:
     """Detection score at several rates of false alarms."""
     truths, images = sum(len(one.keypoints) for one in test), len(test)
     print(f"{images} images, {truths} keypoints\nfalse alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
-    last = [judged(after, one.fitted)[0] for one in test]
-    both = [verify.combined(one.odds, then) for one, then in zip(test, last, strict=True)]
+    known = [one.keypoints for one in test]
+    last = [judged(after, one.fitted)[0] for one in fits]
+    both = [verify.combined(one.odds, then) for one, then in zip(fits, last, strict=True)]
+    fitted = [one.fitted for one in fits]
     rows = {
         "candidates": [(np.log(one.score / (1.0001 - one.score)), one.right) for one in test],
-        "first judge": [_reported(one.odds, one.corrected, one.keypoints) for one in test],
-        "second judge": [_reported(then, one.fitted, one.keypoints) for then, one in zip(last, test, strict=True)],
-        "both": [_reported(mean, one.fitted, one.keypoints) for mean, one in zip(both, test, strict=True)],
+        "first judge": map(_reported, [one.odds for one in fits], [one.corrected for one in fits], known),
+        "second judge": map(_reported, last, fitted, known),
+        "both": map(_reported, both, fitted, known),
     }
     for name, pairs in rows.items():
         score, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
@@ -316,13 +338,17 @@ def report(test: list[Looked], after: Judge) -> None:
             sure = score >= np.log(limit / (1 - limit))
             hits, misses = (right & sure).sum() / truths, (~right & sure).sum() / images
             print(f"    at {limit}: detection {hits:.3f}, alarms {misses:.3f}")
-    fits = sum(len(one.fitted) for one in test)
     print(
-        f"fitted: {fits / images:.1f} of {sum(one.posed.place.max(initial=-1) + 1 for one in test) / images:.1f} places"
+        f"fitted: {sum(map(len, fitted)) / images:.1f} of "
+        f"{sum(one.posed.place.max(initial=-1) + 1 for one in test) / images:.1f} places"
     )
-    for name, column, reach in (("posed", "posed", 0.2), ("corrected", "corrected", 0.1), ("fitted", "fitted", 0.1)):
-        right = [_truths_explained(getattr(one, column), one.keypoints, reach) for one in test]
-        print(f"keypoints that a {name} hypothesis explains: {sum(right) / truths:.3f}")
+    for name, column, reach in (
+        ("posed", [one.posed for one in test], 0.2),
+        ("corrected", [one.corrected for one in fits], 0.1),
+        ("fitted", fitted, 0.1),
+    ):
+        right = sum(map(_truths_explained, column, known, [reach] * images))
+        print(f"keypoints that a {name} hypothesis explains: {right / truths:.3f}")
 
 
 def _truths_explained(found: verify.Hypotheses, keypoints: np.ndarray, tolerance: float) -> int:
@@ -338,10 +364,9 @@ def _reported(odds: np.ndarray, found: verify.Hypotheses, keypoints: np.ndarray)
     return odds[kept], explains(found.xy, _ids(found), keypoints, 0.1)[kept]
 
 
-def to_onnx(judge: Judge) -> bytes:
+def to_onnx(judge: Judge, found: list[verify.Hypotheses]) -> bytes:
     """A judge as ONNX: inputs ``view`` and ``evidence``, outputs ``odds``, ``shift``, ``log_map``."""
-    example = (torch.zeros(2, 2, VIEW_PX, VIEW_PX), torch.zeros(2, len(judge.mean)))
-    return exported(judge, example, ["view", "evidence"])
+    return exported(judge, [_tensors(some) for some in found if len(some)][:100], ["view", "evidence"])
 
 
 if __name__ == "__main__":

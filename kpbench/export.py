@@ -7,13 +7,14 @@ import json
 import logging
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
@@ -21,7 +22,6 @@ from kpbench.design import parse_patch
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.geometry import resize
-from kpbench.keypoints import UInt8
 from kpbench.network import CELL, SuperPoint
 from kpbench.runtime import open_session
 from kpbench.samples import SampleConfig, load_photos, make_batch
@@ -146,9 +146,9 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     textures = load_photos(None, "training")
     scenes = make_batch(SampleConfig("scenes", (640, 480)), patches, textures, 0, 0, 40, 0.5).images
     sizes = [(round(scale * 640), round(scale * 480)) for scale in SCALES]
-    images = [resize(scene, *sizes[n % len(sizes)]) for n, scene in enumerate(scenes)]
+    images = [pad_to_cells(resize(scene, *sizes[n % len(sizes)])) for n, scene in enumerate(scenes)]
     content["int8"] = f"uint8 activations, 7-bit weights, ranges of {len(images)} scenes"
-    quantised = quantise(given, images)
+    quantised = quantise(given, ({"image": np.float32(1 / 255) * image[None, None]} for image in images))
     onnx.helper.set_model_props(quantised, {"kpbench": json.dumps(content, sort_keys=True)})
     written = cast(bytes, quantised.SerializeToString())
     image = np.random.default_rng(0).random((1, 1, 72, 104), np.float32)
@@ -157,8 +157,8 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     return Exported(len(written), content["step"], difference)
 
 
-def quantise(model: Any, images: Iterable[UInt8]) -> Any:
-    """An ONNX model of a network in 8-bit integers; the ranges of its activations are those of these grey images.
+def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any:
+    """An ONNX model with its convolutions in 8-bit integers; the ranges of its activations are those of these inputs.
 
     Weights keep 7 bits, so that the sums of products fit 16 on processors that have no better instruction:
     with 8 those would saturate, and give other results than the rest.
@@ -168,11 +168,10 @@ def quantise(model: Any, images: Iterable[UInt8]) -> Any:
 
     class Reader(CalibrationDataReader):  # type: ignore[misc]
         def __init__(self) -> None:
-            self.images: Iterator[UInt8] = iter(images)
+            self.feeds = iter(feeds)
 
-        def get_next(self) -> dict[str, Any] | None:
-            image = next(self.images, None)
-            return None if image is None else {"image": np.float32(1 / 255) * pad_to_cells(image)[None, None]}
+        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
+            return next(self.feeds, None)
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "int8.onnx"
@@ -187,6 +186,7 @@ def quantise(model: Any, images: Iterable[UInt8]) -> Any:
                 reduce_range=True,
                 activation_type=QuantType.QUInt8,
                 weight_type=QuantType.QInt8,
+                op_types_to_quantize=["Conv", "Relu", "MaxPool"],
             )
         finally:
             logging.disable(logging.NOTSET)

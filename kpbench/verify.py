@@ -5,7 +5,8 @@ surroundings of each such place and says which ellipse the patch fills, if there
 designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.match`), what may be a patch is fitted
 to the pixels (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a judge, a small network too, sees
 the place in the frame of the patch, beside the design, and what was measured. It gives the log odds that there is a
-patch of this design at this place, and how far the pose is off. The weighted mean of both log odds counts.
+patch of this design at this place, and how far the pose is off; the first one looks twice, the second time in the pose
+that it took for right (:func:`again`). The weighted mean of both judges' log odds counts.
 ``benchmarks/ellipses.py`` and ``benchmarks/verification.py`` train the three, on synthetic images.
 """
 
@@ -35,6 +36,7 @@ __all__ = [
     "POSED",
     "Examined",
     "Hypotheses",
+    "again",
     "combined",
     "distinct",
     "ellipses",
@@ -48,12 +50,13 @@ __all__ = [
     "version",
 ]
 
+NCC = "-log(1.01 - correlation of the whole design)"
 POSED = (
     "log odds of the network's score",
     "log probability that the ID head sees a patch",
     "log probability of the design by the ID head",
     "log odds that an ellipse here is a patch",
-    "-log(1.01 - correlation of the whole design)",
+    NCC,
     "log of the distance from the network's place, in short semi-axes",
     "log of contrast over the range of the image",
     "log of contrast over noise",
@@ -81,12 +84,14 @@ TURNED_TWICE = -1.0
 """Log odds from which more sizes of a design, and two rotations where both look alike, are tried."""
 EMPTY = -2.5
 """Log odds that an ellipse is a patch under which a place is left."""
+DIM = -5.0
+"""Log odds at the first look under which there is no second one."""
 HOPELESS = -3.0
 """Log odds before the fit under which a hypothesis is not worth one."""
-SECOND = 0.7
+SECOND = 0.5
 """Weight of the second judge's log odds."""
 USUAL = 60
-"""Places asked about in an image that the judges were trained on, on average: their odds hold for as many."""
+"""About as many places as an image of 640x480 has that the judges were trained on: their odds hold for as many."""
 SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""
 BLOCK = 2**11
@@ -171,6 +176,8 @@ def examine(
     with one_blas_thread():
         before = posed(picture, xy, network_score, log_id, patches, threads)
         odds, corrected = judged("posed", before, patches, threads)
+        before = again(picture, corrected[odds >= DIM], patches)
+        odds, corrected = judged("posed", before, patches, threads)
         hopeful = distinct(corrected, odds)
         found = fitted(picture, corrected[hopeful], patches)
     odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
@@ -225,21 +232,38 @@ def posed(
     place, which = np.nonzero((likely | (odds >= SURE)[:, None]) & (odds >= EMPTY)[:, None])
     row, poses = match.turn(levels, centre[place], A[place], which, known, (odds >= TURNED_TWICE)[place])
     place, which = place[row], which[row]
-    view, contrast = match.view(levels, poses.xy, poses.A, which, known)
-    minor = _minor(poses.A)
-    evidence = np.column_stack(
+    said = np.column_stack(
         [
             _log_odds(network_score[place]),
             np.log(np.maximum(1 - np.exp(log_id[place, -1]), 1e-4)),
             log_id[place, which],
             odds[place],
-            -np.log(1.01 - poses.ncc),
-            np.log(np.linalg.norm(poses.xy - xy[place], axis=1) / minor + 0.02),
-            *_contrasts(contrast, picture),
-            np.log(minor),
         ]
     )
-    return Hypotheses(place, xy[place], which, poses.xy, poses.A, view, evidence)[contrast > FAINTEST]
+    return _shown(picture, place, xy[place], poses, said, known)
+
+
+def again(picture: Picture, found: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
+    """Hypotheses that a judge has moved, as the image shows them where they are now."""
+    known, poses = match.bank(patches), match.Poses(found.xy, found.A, found.which, np.zeros(len(found)))
+    there = match.align(picture.smooth, poses, known.whole, 0, match.WHOLE_PX)
+    return _shown(picture, found.place, found.at, there, found.evidence[:, : POSED.index(NCC)], known)
+
+
+def _shown(
+    picture: Picture, place: NDArray[np.int64], at: Float, poses: match.Poses, said: Float, known: match.Bank
+) -> Hypotheses:
+    """What the first judge looks at: the image in these poses, and what the networks ``said`` of the places."""
+    view, contrast = match.view(picture.smooth, poses.xy, poses.A, poses.which, known)
+    minor = _minor(poses.A)
+    measured = [
+        -np.log(1.01 - poses.ncc),
+        np.log(np.linalg.norm(poses.xy - at, axis=1) / minor + 0.02),
+        *_contrasts(contrast, picture),
+        np.log(minor),
+    ]
+    evidence = np.column_stack([said, *measured])
+    return Hypotheses(place, at, poses.which, poses.xy, poses.A, view, evidence)[contrast > FAINTEST]
 
 
 def likeliest(place: NDArray[np.int64], odds: Float) -> NDArray[np.int64]:
@@ -310,10 +334,14 @@ def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.
     return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
 
 
-def version() -> str:
-    """Which networks these are and which code asks them: the first digits of the SHA-256 of both."""
+def version(*asked: object) -> str:
+    """Which networks these are, which code asks them, and for what places: the first digits of a SHA-256.
+
+    ``asked``: what decides which places are asked about.
+    """
     code = (Path(str(module)).read_bytes() for module in (__file__, match.__file__, refine.__file__))
-    return hashlib.sha256(b"".join([*map(_weights, ("ellipse", "posed", "fitted")), *code])).hexdigest()[:8]
+    parts = [*map(_weights, ("ellipse", "posed", "fitted")), *code, repr(asked).encode()]
+    return hashlib.sha256(b"".join(parts)).hexdigest()[:8]
 
 
 def _weights(name: str) -> bytes:

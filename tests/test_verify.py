@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,21 @@ def test_a_symmetric_map_and_a_shift_within_it_move_a_pose():
     )
     np.testing.assert_allclose(A[0], [[0.0, -2.0], [6.0, 0.0]], atol=1e-6)
     np.testing.assert_allclose(xy[0], [5.0, 9.0], atol=1e-6)
+
+
+def test_a_second_look_shows_a_place_in_the_pose_that_it_is_given():
+    image, xy, which = scene()
+    picture, log_id = verify.Picture(image), np.log(np.full((2, len(PATCHES) + 1), 0.2))
+    posed = verify.posed(picture, xy, np.full(2, SURE), log_id, PATCHES)
+    posed = posed[posed.which == np.array(which)[posed.place]]
+    same = verify.again(picture, posed, PATCHES)
+    np.testing.assert_allclose(same.evidence, posed.evidence, atol=0.1)
+    np.testing.assert_array_equal(same.view, posed.view)
+    off = verify.again(picture, replace(posed, xy=posed.xy + 3.0), PATCHES)
+    correlation = verify.POSED.index(verify.NCC)
+    assert np.all(off.evidence[:, correlation] < posed.evidence[:, correlation] - 0.3)
+    np.testing.assert_array_equal(off.at, posed.at)
+    assert len(verify.again(picture, posed[:0], PATCHES)) == 0
 
 
 def test_evidence_has_a_column_for_each_name_and_none_for_no_places():

@@ -159,9 +159,9 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
-CANDIDATE = 0.02
+CANDIDATE = 0.03
 """Least score of the network from which a place is worth verifying."""
-SCALES = (1.5, 0.6, 0.25)
+SCALES = (1.4, 0.6, 0.25)
 """Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
 SAME_PX = 3.0
 """Candidates of two scales that are nearer to each other than this are one."""
@@ -220,7 +220,7 @@ class SuperPointDetector:
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
         self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
         if self.verified:
-            self.version += f"-{verify.version()}"
+            self.version += f"-{verify.version(CANDIDATE, self.scales)}"
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     def __call__(self, image: UInt8) -> Detections:
