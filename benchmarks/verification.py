@@ -199,8 +199,8 @@ def main() -> None:
     after = trained([one.fitted for part in fits[:-1] for one in part], truths, 0.1, 16, options.epochs)
     report(sets[-1], fits[-1], after)
     if options.write:
-        seen = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]
-        for name, judge, found in zip(("posed", "fitted"), (before, after), seen, strict=True):
+        ranges = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]
+        for name, judge, found in zip(("posed", "fitted"), (before, after), ranges, strict=True):
             target = Path(verify.__file__).parent / "weights" / f"{name}.onnx"
             target.write_bytes(to_onnx(judge, found))
             print(f"{target.name}: {target.stat().st_size} bytes")
