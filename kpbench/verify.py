@@ -6,7 +6,8 @@ designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench
 to the pixels (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a judge, a small network too, sees
 the place in the frame of the patch, beside the design, and what was measured. It gives the log odds that there is a
 patch of this design at this place, and how far the pose is off; the first one looks twice, the second time in the pose
-that it took for right (:func:`again`). The weighted mean of both judges' log odds counts.
+that it took for right (:func:`again`). The second one knows what the first one says, and what other patches the image
+seems to have: blur and contrast of one are those of all. Its log odds count.
 ``benchmarks/ellipses.py`` and ``benchmarks/verification.py`` train the three, on synthetic images.
 """
 
@@ -37,7 +38,6 @@ __all__ = [
     "Examined",
     "Hypotheses",
     "again",
-    "combined",
     "distinct",
     "ellipses",
     "examine",
@@ -73,23 +73,26 @@ FITTED = (
     "log of contrast over the range of the image, by the fit",
     "log of contrast over noise, by the fit",
     "log of the short semi-axis, px, by the fit",
+    "log odds by the first judge",
+    "log of 1 + the number of other patches that the image probably has",
+    "log of 1 + the number of other hypotheses that are probably wrong",
+    "log of blur, px, over that of the other patches",
+    "log of contrast over that of the other patches",
 )
 """The columns of the evidence of :func:`fitted`."""
 
 DOUBT = 3.0
 """Designs whose log-probability by the ID head is further behind the likeliest one's are not tried, ..."""
-SURE = 3.0
+SURE = 0.0
 """... but for places that lie on a patch with these log odds: there all are."""
-TURNED_TWICE = -1.0
-"""Log odds from which more sizes of a design, and two rotations where both look alike, are tried."""
-EMPTY = -2.5
+TURNED_TWICE = -4.8
+"""Log odds that an ellipse is a patch from which more sizes, and two rotations where both look alike, are tried."""
+EMPTY = -6.0
 """Log odds that an ellipse is a patch under which a place is left."""
-DIM = -5.0
+DIM = -6.0
 """Log odds at the first look under which there is no second one."""
-HOPELESS = -3.0
+HOPELESS = -4.0
 """Log odds before the fit under which a hypothesis is not worth one."""
-SECOND = 0.5
-"""Weight of the second judge's log odds."""
 USUAL = 60
 """About as many places as an image of 640x480 has that the judges were trained on: their odds hold for as many."""
 SAME = 0.2
@@ -115,6 +118,7 @@ class Hypotheses:
     which : (n,) index of the design.
     xy, A : (n, 2) px, (n, 2, 2) patch frame to px.
     view : (n, VIEW_PX²) from :func:`kpbench.match.view`, nan outside the image.
+    blur_px : (n,) standard deviation by the fit, 0 before it.
     evidence : (n, len(POSED)) or (n, len(FITTED))
     """
 
@@ -124,6 +128,7 @@ class Hypotheses:
     xy: Float
     A: Float
     view: NDArray[np.float32]
+    blur_px: Float
     evidence: Float
 
     def __len__(self) -> int:
@@ -179,8 +184,8 @@ def examine(
         before = again(picture, corrected[odds >= DIM], patches)
         odds, corrected = judged("posed", before, patches, threads)
         hopeful = distinct(corrected, odds)
-        found = fitted(picture, corrected[hopeful], patches)
-    odds = combined(odds[hopeful], judged("fitted", found, patches, threads)[0])
+        found = fitted(picture, corrected[hopeful], odds[hopeful], patches)
+    odds, _ = judged("fitted", found, patches, threads)
     # an image has so many patches, however many places it has that look like one
     odds = odds - np.log(max(1.0, len(xy) / USUAL))
     best = likeliest(found.place, odds)
@@ -263,18 +268,14 @@ def _shown(
         np.log(minor),
     ]
     evidence = np.column_stack([said, *measured])
-    return Hypotheses(place, at, poses.which, poses.xy, poses.A, view, evidence)[contrast > FAINTEST]
+    found = Hypotheses(place, at, poses.which, poses.xy, poses.A, view, np.zeros(len(at)), evidence)
+    return found[contrast > FAINTEST]
 
 
 def likeliest(place: NDArray[np.int64], odds: Float) -> NDArray[np.int64]:
     """The likeliest hypothesis of every place (indices of hypotheses), in the order of the places."""
     order = np.lexsort((-odds, place))
     return order[np.flatnonzero(np.diff(place[order], prepend=-1))]
-
-
-def combined(before: Float, after: Float) -> Float:
-    """Log odds (n,) from those of the judges before and after the fit."""
-    return (1 - SECOND) * before + SECOND * after
 
 
 def distinct(found: Hypotheses, odds: Float, least: float = HOPELESS) -> NDArray[np.int64]:
@@ -287,8 +288,11 @@ def distinct(found: Hypotheses, odds: Float, least: float = HOPELESS) -> NDArray
     return np.sort(np.concatenate(kept))
 
 
-def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
-    """The same hypotheses with the pose that fits the pixels best, or their own where that went far away from it."""
+def fitted(picture: Picture, before: Hypotheses, odds: Float, patches: Sequence[Patch]) -> Hypotheses:
+    """The same hypotheses with the pose that fits the pixels best, or their own where that went far away from it.
+
+    ``odds`` : (n,) log odds by the first judge.
+    """
     fit = refine.fit(picture.raw, before.xy, before.A, [patches[n] for n in before.which])
     contrast, minor = np.maximum(fit.white - fit.black, FAINTEST), _minor(fit.A)
     gone, moved_on = (np.linalg.norm(fit.xy - start, axis=1) / minor for start in (before.at, before.xy))
@@ -302,13 +306,36 @@ def fitted(picture: Picture, before: Hypotheses, patches: Sequence[Patch]) -> Hy
             np.log(moved_on + 0.02),
             *_contrasts(contrast, picture),
             np.log(minor),
+            odds,
         ]
     )
     away = moved_on > FAR
     xy, A = np.where(away[:, None], before.xy, fit.xy), np.where(away[:, None, None], before.A, fit.A)
     view, _ = match.view(picture.smooth, xy, A, before.which, match.bank(patches))
-    evidence = np.column_stack([before.evidence, measured])
-    return Hypotheses(before.place, before.at, before.which, xy, A, view, evidence)
+    beside = _beside(xy, minor, odds, np.column_stack([np.log(fit.blur_px + 0.3), np.log(contrast)]))
+    evidence = np.column_stack([before.evidence, measured, beside])
+    return Hypotheses(before.place, before.at, before.which, xy, A, view, fit.blur_px, evidence)
+
+
+def _beside(xy: Float, minor: Float, odds: Float, like: Float) -> Float:
+    """How a hypothesis compares with those elsewhere in the image that are likely.
+
+    Parameters
+    ----------
+    xy, minor, odds : (n, 2) px, (n,) px, and (n,) log odds by the first judge.
+    like : (n, k) what patches of one image have in common.
+
+    Returns
+    -------
+    (n, 2 + k): logs of 1 + how many other hypotheses are probably right, and wrong, and how far each column of
+    ``like`` is from the mean of the right ones, less where they are hardly one.
+    """
+    right = 1 / (1 + np.exp(-odds))
+    elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor[:, None]
+    patches, others = elsewhere @ right, elsewhere @ (1 - right)
+    weight = elsewhere * right / (patches + 0.3)[:, None]
+    apart = like * weight.sum(axis=1, keepdims=True) - weight @ like
+    return np.column_stack([np.log1p(patches), np.log1p(others), apart])
 
 
 def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
@@ -326,10 +353,12 @@ def judged(stage: str, found: Hypotheses, patches: Sequence[Patch], threads: int
 def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.float32]]:
     """What a judge looks at: ``view`` (n, 2, 32, 32), the place and the design, and ``evidence`` (n, columns).
 
-    Outside the image there is neither: both are 0.
+    The design is as blurred as the fit found the image. Outside the image there is neither: both are 0.
     """
-    side = match.VIEW_PX
-    pair = np.stack([found.view, match.bank(patches).picture[found.which]], axis=1)
+    side, design = match.VIEW_PX, match.bank(patches).picture[found.which]
+    soft = np.flatnonzero(found.blur_px)
+    design[soft] = match.blurred(design[soft], found.A[soft], found.blur_px[soft])
+    pair = np.stack([found.view, design], axis=1)
     pair[np.broadcast_to(np.isnan(found.view)[:, None], pair.shape)] = 0
     return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
 

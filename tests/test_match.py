@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -136,3 +137,15 @@ def test_a_view_knows_what_lies_outside_and_takes_its_inks_from_what_does_not():
     away, least = match.view(match.pyramid(image), np.array([[400.0, 60.0]]), A, which, KNOWN)
     assert np.isnan(away).all()
     assert least[0] == 2.0
+
+
+def test_blur_of_the_image_is_seen_in_the_frame_of_a_patch():
+    side = match.VIEW_PX
+    px = side / (2 * match.LOOKUP_HALF)  # of the view, in a radius
+    axes = np.array([8.0, 20.0])
+    soft = match.blurred(KNOWN.picture, np.tile(turn(90) @ np.diag(axes), (len(PATCHES), 1, 1)), np.full(4, 2.0))
+    inner = slice(8, -8)  # the border of the view is not the same
+    for before, after in zip(KNOWN.picture.reshape(-1, side, side), soft.reshape(-1, side, side), strict=True):
+        expected = cv2.GaussianBlur(before, (0, 0), 2.0 * px / axes[0], sigmaY=2.0 * px / axes[1])
+        np.testing.assert_allclose(after[inner, inner], expected[inner, inner], atol=0.03)
+    assert match.blurred(KNOWN.picture[:0], np.zeros((0, 2, 2)), np.zeros(0)).shape == (0, side**2)
