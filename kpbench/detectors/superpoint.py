@@ -163,6 +163,8 @@ CANDIDATE = 0.03
 """Least score of the network from which a place is worth verifying."""
 SCALES = (1.4, 0.6, 0.25)
 """Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
+LIKELY = 0.3
+"""Least probability of a verified detection: on training photographs few false alarms have as much at 1624x1240."""
 SAME_PX = 3.0
 """Candidates of two scales that are nearer to each other than this are one."""
 
@@ -176,8 +178,8 @@ class SuperPointDetector:
     path : Path, optional
         ONNX file written by ``kpbench export-model``; None: the weights that ship with kpbench, in 8-bit
         integers for a processor, float32 for a GPU.
-    threshold : float
-        Least score of a detection, in [0, 1].
+    threshold : float, optional
+        Least score of a detection, in [0, 1]; None: 0.5 of the network alone, 0.3 where it is verified.
     verified : bool
         Whether the network's candidates are compared with the designs, which the file holds
         (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides, at
@@ -194,7 +196,7 @@ class SuperPointDetector:
     """
 
     path: Path | None = None
-    threshold: float = 0.5
+    threshold: float | None = None
     verified: bool = True
     threads: int = 0
     scales: tuple[float, ...] = SCALES
@@ -222,6 +224,10 @@ class SuperPointDetector:
         if self.verified:
             self.version += f"-{verify.version(CANDIDATE, self.scales)}"
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
+
+    @property
+    def _least(self) -> float:
+        return self.threshold if self.threshold is not None else LIKELY if self.verified else 0.5
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
@@ -256,7 +262,7 @@ class SuperPointDetector:
         -------
         Places (n, 2) px, their scores (n,), and log-probabilities (n, ids + 1) of each design and of none; best first.
         """
-        how = Decoding(CANDIDATE if self.verified else self.threshold)
+        how = Decoding(CANDIDATE if self.verified else self._least)
         height, width = greys[0].shape
         found: list[list[tuple[Float, Float, Float]]] = [[] for _ in greys]
         for scale in self.scales if self.verified else (1.0,):
@@ -276,7 +282,7 @@ class SuperPointDetector:
         if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify.examine(grey, xy, score, log_id, self.patches, self.threads)
-        sure = np.flatnonzero((found.score >= self.threshold) & _inside(found.xy, grey))
+        sure = np.flatnonzero((found.score >= self._least) & _inside(found.xy, grey))
         xy, score, apart = found.xy[sure], found.score[sure], 0.6 * found.minor_px[sure]
         # discs do not overlap: of two centres within one disc the likelier stays
         kept = suppress(xy, score, np.maximum(Decoding.separation_px, apart))
