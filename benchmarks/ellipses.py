@@ -141,12 +141,12 @@ def main() -> None:
             parts += tqdm(pool.map(partial(places, path, True), range(count), chunksize=4), path, count, leave=False)
         network = trained(_together(parts), options.epochs)
         count = len(kpbench.open_dataset(options.test))
-        test = list(pool.map(partial(places, options.test, False), range(count), chunksize=4))
-    calibrate(network, _together(test))
-    report(network, _together(test), count)
+        test = _together(list(pool.map(partial(places, options.test, False), range(count), chunksize=4)))
+    calibrate(network, test)
+    report(network, test, count)
     if options.write:
         target = Path(verify.__file__).parent / "weights" / "ellipse.onnx"
-        seen = [(some.float(),) for some in _together(test)[0][:4096].split(64)]
+        seen = [(some.float(),) for some in test[0][:4096].split(64)]
         target.write_bytes(exported(network, seen, ["surroundings"]))
         print(f"{target.name}: {target.stat().st_size} bytes")
 

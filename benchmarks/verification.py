@@ -195,7 +195,7 @@ def main() -> None:
             found = pool.map(partial(fit, path, path != options.test), range(len(part)), [one.posed for one in part])
             fits.append(list(tqdm(found, f"fit {path}", len(part))))
     found = [one.fitted for part in fits[:-1] for one in part]
-    after = trained(found, truths, np.zeros(sum(map(len, found))), 0.1, 64, options.epochs)
+    after = trained(found, truths, np.zeros(sum(map(len, found))), 0.1, 48, options.epochs)
     report(sets[-1], fits[-1], after)
     if options.write:
         ranges = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]

@@ -227,7 +227,7 @@ class SuperPointDetector:
 
     @property
     def _least(self) -> float:
-        return self.threshold if self.threshold is not None else LIKELY if self.verified else 0.5
+        return self.threshold if self.threshold is not None else LIKELY if self.verified else Decoding.threshold
 
     def __call__(self, image: UInt8) -> Detections:
         """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
