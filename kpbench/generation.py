@@ -266,9 +266,11 @@ def _head(path: Path) -> tuple[str, tuple[str, ...], range]:
 
 
 def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """The first option in which two configs differ, for people."""
+    """The first option in which two configs differ, for people; of a table, the first entry."""
     for key in here:
         if there.get(key) != here[key]:
+            if isinstance(there.get(key), dict) and isinstance(here[key], dict):
+                return _difference(there[key], here[key])
             values = [str(config.get(key)) for config in (there, here)]
             said = f" is {values[0]} there, {values[1]} here" if max(map(len, values)) < 40 else " differs"
             return f" ({key}{said})"

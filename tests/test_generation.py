@@ -210,6 +210,8 @@ def test_another_run_is_told_what_differs(photos, tmp_path):
     generate(config(photos), tmp_path, workers=1)
     with pytest.raises(DataError, match=r"\(seed is 0 there, 9 here\)"):
         generate(config(photos, seed=9), tmp_path, workers=1, resume=True)
+    with pytest.raises(DataError, match=r"\(radius_px is \[5.0, 80.0\] there, \[3.0, 20.0\] here\)"):
+        generate(config(photos, limits=Limits(radius_px=(3.0, 20.0))), tmp_path, workers=1, resume=True)
 
 
 def test_a_folder_with_other_files_is_left_alone(photos, tmp_path):
