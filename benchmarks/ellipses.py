@@ -30,11 +30,9 @@ from tqdm import tqdm
 import kpbench
 from kpbench import match, verify
 from kpbench.detect import to_grey
-from kpbench.detectors import superpoint
+from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.workers import cores, one_thread
 
-WEAKEST = 0.01
-"""Least score of the detector's network from which its places are shown."""
 NEAR, FAR = 0.6, 1.0
 """A place within so many short semi-axes of a keypoint is on its patch; one beyond so many long ones of all on none."""
 EMPTY_PLACES, MADE_PLACES = 14, 3
@@ -72,15 +70,14 @@ class Places(NamedTuple):
     log_map: np.ndarray
 
 
-_detector: superpoint.SuperPointDetector
+_detector: SmallSuperPointDetector
 
 
 def start() -> None:
     """What each worker process keeps."""
     global _detector
     one_thread()
-    superpoint.CANDIDATE = WEAKEST
-    _detector = superpoint.SmallSuperPointDetector()
+    _detector = SmallSuperPointDetector()
 
 
 def places(path: str, disturbed: bool, n: int) -> Places:
