@@ -14,7 +14,9 @@ from __future__ import annotations
 import math
 import pickle
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import cast
 
@@ -29,6 +31,7 @@ __all__ = [
     "CELL",
     "SuperPoint",
     "Targets",
+    "grow",
     "initialise",
     "is_folded",
     "losses",
@@ -184,10 +187,11 @@ def is_folded(weights: dict[str, Tensor]) -> bool:
     return not any(".bn." in name for name in weights)
 
 
-def unfold(network: SuperPoint, images: Tensor) -> None:
+def unfold(network: SuperPoint, images: Tensor, layers: Iterable[nn.Module] | None = None) -> None:
     """Let each BatchNorm pass on what it gets, as its statistics stand on these images (B, 1, H, W) in [0, 1].
 
     The contrary of folding: the network computes what its convolutions alone would, and can be trained on.
+    ``layers`` are the BatchNorms to be set; None: all.
     """
 
     def pass_on(module: nn.Module, given: tuple[Tensor]) -> None:
@@ -198,13 +202,86 @@ def unfold(network: SuperPoint, images: Tensor) -> None:
         bn.weight.copy_((variance + bn.eps).sqrt())
         bn.bias.copy_(mean)
 
-    hooks = [m.register_forward_pre_hook(pass_on) for m in network.modules() if isinstance(m, nn.BatchNorm2d)]
+    chosen = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)] if layers is None else layers
+    hooks = [m.register_forward_pre_hook(pass_on) for m in chosen]
     mode = network.training
     with torch.no_grad():
         network.eval()(images)
     network.train(mode)
     for hook in hooks:
         hook.remove()
+
+
+@torch.no_grad()
+def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
+    """Start a network as a trained one that is narrower, or of another depth (after Chen et al., Net2Net, ICLR 2016).
+
+    Channels that the smaller network lacks keep their random weights, and nothing learnt listens to them yet. In
+    each stage the convolutions that it lacks pass on what they get, and what it has beyond is left out. Where
+    nothing is left out and both halve alike, the network computes what the smaller one does; else it begins near.
+
+    Parameters
+    ----------
+    network : SuperPoint
+        Changed in place.
+    smaller : SuperPoint
+        Its BatchNorm in place, see :func:`unfold`.
+    images : Tensor of shape (B, 1, H, W) in [0, 1]
+        On which the BatchNorm of convolutions that pass on stands.
+    source : str
+        Name of the smaller network, for messages.
+
+    Returns
+    -------
+    str
+        One line that says what became of it.
+
+    Raises
+    ------
+    DataError
+        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of them: what
+        passes on would lose its negative part.
+    """
+    if "after" in (smaller.config.norm, network.config.norm):
+        raise DataError(f"{source}: has other sizes than [network], and can grow only where norm is 'before' in both")
+    passing: list[nn.Module] = []
+    width, left_out = 1, 0
+    for n, (stage, theirs) in enumerate(zip(network.backbone, smaller.backbone, strict=True)):
+        for layer, given in zip_longest(_blocks(stage), _blocks(theirs)):
+            if layer is None:
+                left_out += 1
+            elif given is None:
+                nn.init.dirac_(cast(Tensor, layer.get_submodule("conv").weight)[:width])
+                passing.append(layer.get_submodule("bn"))
+            else:
+                width = _take(layer, given, width, f"{source}: stage {n + 1}")
+    for head in ("detector", "descriptor"):
+        heard = width
+        for name in (f"{head}.0", f"{head}.1", f"{head}_attached"):
+            heard = _take(network.get_submodule(name), smaller.get_submodule(name), heard, f"{source}: {name}")
+    unfold(network, images, passing)
+    return f"{source}: taken into a larger network; convolutions that pass on: {len(passing)}, left out: {left_out}"
+
+
+def _blocks(stage: nn.Module) -> list[nn.Module]:
+    return [part for part in stage.children() if isinstance(part, nn.Sequential)]
+
+
+def _take(layer: nn.Module, given: nn.Module, heard: int, place: str) -> int:
+    """Put a trained convolution and its BatchNorm into the first channels of another; how many those are."""
+    own, theirs = (cast(nn.Conv2d, getattr(part, "conv", part)) for part in (layer, given))
+    width = theirs.out_channels
+    if width > own.out_channels:
+        raise DataError(f"{place} is {width} wide, expected at most {own.out_channels}")
+    own.weight[:width] = 0
+    own.weight[:width, :heard] = theirs.weight
+    cast(Tensor, own.bias)[:width] = cast(Tensor, theirs.bias)
+    if layer is not own:
+        kept = layer.get_submodule("bn").state_dict()
+        for key, value in given.get_submodule("bn").state_dict().items():
+            if value.ndim:
+                kept[key][:width] = value
+    return width
 
 
 # Losses -----------------------------------------------------------------------------------------------

@@ -32,8 +32,8 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
-from kpbench.network import SuperPoint, initialise, is_folded, losses, make_targets, read_weights, unfold
-from kpbench.recipe import Recipe, parse_recipe
+from kpbench.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
+from kpbench.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.samples import Batch, Job, load_photos, make_batch, stream
 from kpbench.store import write_atomic
 
@@ -128,8 +128,8 @@ def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Sup
     return network.eval()
 
 
-def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Tensor]:
-    """A state-dict to start from.
+def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[str, Tensor], NetworkConfig | None]:
+    """A state-dict to start from, and the sizes of its network where they are told.
 
     Published SuperPoint weights, the running mean of a checkpoint, or an ONNX file of ``kpbench export-model``,
     ``superpoint-small`` being the one that ships. An ID head for other designs is left out.
@@ -138,7 +138,7 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Ten
     if path.suffix != ".onnx":
         weights = read_weights(path)
         mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
-        return mean or weights
+        return mean or weights, None
     import onnx
 
     try:
@@ -151,7 +151,8 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> dict[str, Ten
         raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
     weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
     same = content.get("designs") == designs_digest(patches)
-    return {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
+    kept = {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
+    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
 
 
 def _shipped(path: str | Path) -> Path:
@@ -338,12 +339,7 @@ def train(
     if resume_run:
         resume(state, checkpoint, designs)
     elif init is not None:
-        weights = initial_weights(init, designs)
-        say(initialise(state.network, weights, str(init)))
-        if is_folded(weights):
-            photos = load_photos(backgrounds, "training")
-            batch = make_batch(recipe.samples, designs, photos, recipe.seed, 0, 128, recipe.phase(0)[1])
-            unfold(state.network, _blob(torch.from_numpy(batch.images).to(device)))
+        say(_begin_from(init, state.network, recipe, designs, backgrounds, device))
         state.mean.load_state_dict(state.network.state_dict())
     held_out = load_photos(backgrounds, "validation") if rank == 0 else []
     validation = validation_set(recipe, designs, held_out, validation_images) if rank == 0 else None
@@ -390,6 +386,29 @@ def train(
     if interrupted:
         raise KeyboardInterrupt(f"{checkpoint} is at step {state.step}; the same command with --resume goes on")
     return state.step >= recipe.steps
+
+
+def _begin_from(
+    init: str | Path,
+    network: SuperPoint,
+    recipe: Recipe,
+    patches: Sequence[Patch],
+    backgrounds: str | Path | None,
+    device: torch.device,
+) -> str:
+    """Put initial weights into a network, grown where it has other sizes; one line that says what matched."""
+    weights, sizes = initial_weights(init, patches)
+    theirs = replace(sizes or recipe.network, ids=recipe.network.ids)
+    given = network if theirs == recipe.network else start(replace(recipe, network=theirs), device).network
+    line = initialise(given, weights, str(init))
+    if is_folded(weights):
+        photos = load_photos(backgrounds, "training")
+        batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, 128, recipe.phase(0)[1])
+        images = _blob(torch.from_numpy(batch.images).to(device))
+        unfold(given, images)
+        if given is not network:
+            line = grow(network, given, images, str(init))
+    return line
 
 
 def _place() -> tuple[int, int, torch.device]:

@@ -1,10 +1,13 @@
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from kpbench.errors import DataError
-from kpbench.network import SuperPoint, initialise, losses, make_targets, read_weights
+from kpbench.network import SuperPoint, grow, initialise, losses, make_targets, read_weights
 from kpbench.recipe import Loss, NetworkConfig
 
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), head_width=8, descriptor_width=8)
@@ -84,6 +87,40 @@ def test_weights_that_do_not_fit_are_refused(name, value, message):
     network = SuperPoint(NetworkConfig(norm="after"))
     with pytest.raises(DataError, match=f"^{message}$"):
         initialise(network, change(name, value), "f")
+
+
+@pytest.mark.parametrize("down", ["max", "stride"])
+def test_a_grown_network_computes_what_the_smaller_one_does(down):
+    torch.manual_seed(0)
+    smaller = SuperPoint(NetworkConfig((4, 4, 8, 8), (1, 2, 1, 1), down, 8, 8)).eval()
+    for name, tensor in smaller.named_parameters():
+        if ".bn." in name:
+            torch.nn.init.uniform_(tensor, 0.5, 1.5)
+    network = SuperPoint(NetworkConfig((6, 4, 12, 16), (2, 2, 1, 3), down, 12, 8)).eval()
+    images = torch.rand(4, 1, 40, 56)
+    line = grow(network, smaller, images, "small.onnx")
+    assert line == "small.onnx: taken into a larger network; convolutions that pass on: 3, left out: 0"
+    with torch.no_grad():
+        for mine, theirs in zip(network(images), smaller(images), strict=True):
+            assert theirs.std() > 0.01
+            torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"widths": (4, 4, 8, 6)}, "small.onnx: stage 4 is 8 wide, expected at most 6"),
+        ({"descriptor_width": 4}, "small.onnx: descriptor.1 is 8 wide, expected at most 4"),
+        (
+            {"norm": "after"},
+            "small.onnx: has other sizes than [network], and can grow only where norm is 'before' in both",
+        ),
+    ],
+)
+def test_what_is_larger_somewhere_does_not_grow(change, message):
+    network = SuperPoint(replace(TINY, **change))
+    with pytest.raises(DataError, match=f"^{re.escape(message)}$"):
+        grow(network, SuperPoint(TINY), torch.zeros(1, 1, 16, 16), "small.onnx")
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
