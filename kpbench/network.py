@@ -136,7 +136,9 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     except (OSError, SafetensorError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
         why = (str(error) or type(error).__name__).splitlines()[0]
         raise DataError(f"{path}: cannot be read as weights ({why})") from None
-    if not isinstance(loaded, dict) or not all(isinstance(value, Tensor) for value in loaded.values()):
+    if not isinstance(loaded, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in loaded.items()
+    ):
         raise DataError(f"{path}: holds no state-dict, expected names with tensors")
     return loaded
 
@@ -234,7 +236,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
     Returns
     -------
     str
-        One line that says what became of it.
+        What became of it, in a few words.
 
     Raises
     ------
@@ -243,7 +245,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
         passes on would lose its negative part.
     """
     if "after" in (smaller.config.norm, network.config.norm):
-        raise DataError(f"{source}: has other sizes than [network], and can grow only where norm is 'before' in both")
+        raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")
     passing: list[nn.Module] = []
     width, left_out = 1, 0
     for n, (stage, theirs) in enumerate(zip(network.backbone, smaller.backbone, strict=True)):
@@ -260,7 +262,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
         for name in (f"{head}.0", f"{head}.1", f"{head}_attached"):
             heard = _take(network.get_submodule(name), smaller.get_submodule(name), heard, f"{source}: {name}")
     unfold(network, images, passing)
-    return f"{source}: taken into a larger network; convolutions that pass on: {len(passing)}, left out: {left_out}"
+    return f"taken into another network, convolutions that pass on: {len(passing)}, left out: {left_out}"
 
 
 def _blocks(stage: nn.Module) -> list[nn.Module]:

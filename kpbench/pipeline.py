@@ -98,7 +98,8 @@ def predict_images(
     """
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[Found](), list[str]()
-    with image_writer(overlay, source.fps) as draw, contextlib.suppress(KeyboardInterrupt):
+    endless = () if source.length is not None else (KeyboardInterrupt,)
+    with image_writer(overlay, source.fps) as draw, contextlib.suppress(*endless):
         # a camera never ends: Ctrl-C keeps what was found so far
         for label, image in source.images:
             found.append(

@@ -137,6 +137,8 @@ class Recipe:
     def __post_init__(self) -> None:
         if not self.phases or min(p.samples for p in self.phases) < 1 or self.batch < 1:
             raise DataError("phases and batch: expected at least one phase, of at least one sample, and a batch from 1")
+        if not self.steps:
+            raise DataError(f"phases: all have fewer samples than one batch, expected at least {self.batch}")
 
     @property
     def steps(self) -> int:
@@ -227,6 +229,6 @@ def _value(kind: Any, value: Any, source: str, where: str) -> Any:
     accepted = (int, float) if kind is float else kind
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise DataError(f"{source}: {where} is {value!r}, expected {kind.__name__}")
-    if kind is not bool and kind is not str and value < 0:
+    if kind is not bool and kind is not str and not 0 <= value < math.inf:
         raise DataError(f"{source}: {where} is {value!r}, expected a number from 0")
     return kind(value)

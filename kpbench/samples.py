@@ -10,7 +10,7 @@ import multiprocessing
 import signal
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,12 +20,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade
-from kpbench.background import PhotoFolder, procedural
+from kpbench.background import PhotoFolder, decode_photo, procedural
 from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.design import Patch
+from kpbench.errors import DataError
 from kpbench.keypoints import UInt8
 from kpbench.scene import Limits, random_placements, render_scene
-from kpbench.workers import one_thread
+from kpbench.workers import end_with_parent, one_thread
 
 __all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]
 
@@ -52,6 +53,12 @@ class SampleConfig:
     size: tuple[int, int] = (96, 96)
     set_size: int = 20_000
 
+    def __post_init__(self) -> None:
+        if min(self.size) < 8 or any(side % 8 for side in self.size) or self.set_size < 1:
+            raise DataError(
+                f"samples: size {list(self.size)} and set_size {self.set_size}, expected multiples of 8, and at least 1"
+            )
+
 
 class Batch(NamedTuple):
     """Images (B, H, W) uint8, and keypoints (B, K, 4) float32.
@@ -77,7 +84,7 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     Raises
     ------
     DataError
-        As :meth:`kpbench.background.PhotoFolder.open`.
+        As :meth:`kpbench.background.PhotoFolder.open`, or if none of the part can be decoded.
     """
 
     def kept(n: int, count: int) -> bool:
@@ -87,11 +94,16 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
         return [procedural(np.random.default_rng([2410, n]), 640, 480) for n in range(64) if kept(n, 64)]
     photos = PhotoFolder.open(folder)
     files = [name for n, name in enumerate(photos.files) if kept(n, len(photos.files))]
-    read = (cv2.imread(str(photos.path / name), cv2.IMREAD_GRAYSCALE) for name in files)
-    return [_at_most(np.asarray(image, np.uint8)) for image in read if image is not None]
+    read = (decode_photo(photos.path / name, 1) for name in files)
+    good = [image for image in (_at_most(image) for image in read if image is not None) if min(image.shape) >= 8]
+    if not good:
+        raise DataError(
+            f"{folder}: none of the {len(files)} photographs for {part} can be decoded (every tenth validates)"
+        )
+    return good
 
 
-def _at_most(image: NDArray[np.uint8], side: int = 640) -> UInt8:
+def _at_most(image: UInt8, side: int = 640) -> UInt8:
     scale = side / max(image.shape)
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
@@ -145,6 +157,11 @@ def stream(
     """Training batches in the order of their jobs, made ahead by worker processes (0: by this one).
 
     The processes are started afresh, not forked: they load neither torch nor its threads.
+
+    Raises
+    ------
+    DataError
+        As :func:`load_photos`, or if a worker process dies.
     """
     if workers == 0:
         _start_worker(config, patches, folder, seed)
@@ -161,6 +178,8 @@ def stream(
                 yield ahead.popleft().result()
         while ahead:
             yield ahead.popleft().result()
+    except BrokenExecutor:
+        raise DataError("a worker process died (out of memory?)") from None
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -174,12 +193,15 @@ def _start_worker(
     if own:  # the main process decides when to stop, and takes its workers with it
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        end_with_parent()
         one_thread()
-    photos = load_photos(folder, "training")
-    _worker.update(config=config, patches=patches, photos=photos, seed=seed)
+    _worker.clear()
+    _worker.update(config=config, patches=patches, folder=folder, seed=seed)
 
 
 def _work(job: Job) -> Batch:
+    if "photos" not in _worker:  # not in the initializer, whose errors get lost
+        _worker["photos"] = load_photos(_worker.pop("folder"), "training")
     return make_batch(**_worker, index=job.index, count=job.count, severity=job.severity)
 
 

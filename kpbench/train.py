@@ -40,6 +40,8 @@ from kpbench.store import write_atomic
 __all__ = ["State", "designs_digest", "evaluate", "network_of", "read_checkpoint", "train", "validation_set"]
 
 SCHEMA = "kpbench.checkpoint/1"
+SAVE_EVERY = 5.0
+"""Minutes between checkpoints."""
 
 
 # State and checkpoints ---------------------------------------------------------------------------------
@@ -135,10 +137,21 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[st
     ``superpoint-small`` being the one that ships. An ID head for other designs is left out.
     """
     path = _shipped(path)
-    if path.suffix != ".onnx":
+    if path.suffix == ".onnx":
+        content, weights = _read_exported(path)
+    else:
         weights = read_weights(path)
         mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
-        return mean or weights, None
+        if not mean:
+            return weights, None
+        content, weights = read_checkpoint(path)[0], mean
+    same = content.get("designs") == designs_digest(patches)
+    kept = {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
+    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
+
+
+def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """(content, weights) of an ONNX file of ``kpbench export-model``."""
     import onnx
 
     try:
@@ -149,15 +162,14 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[st
         raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
     if "int8" in content:
         raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
-    weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
-    same = content.get("designs") == designs_digest(patches)
-    kept = {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
-    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
+    if content.get("recipe", {}).get("network", {}).get("norm") == "after":
+        raise DataError(f"{path}: its BatchNorm, after the activation, cannot be put back; start from its checkpoint")
+    return content, {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
 
 
 def _shipped(path: str | Path) -> Path:
     ours = Path(__file__).parent / "weights" / f"{path}.onnx"
-    return ours if ours.is_file() and not Path(path).exists() else Path(path)
+    return ours if ours.is_file() and not Path(path).is_file() else Path(path)
 
 
 def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
@@ -273,7 +285,6 @@ def train(
     minutes: float | None = None,
     workers: int = 1,
     threads: int | None = None,
-    save_every: float = 5.0,
     validate_every: float = 15.0,
     validation_images: int = 32,
     tensorboard: bool = False,
@@ -289,7 +300,7 @@ def train(
     backgrounds : path, optional
         Folder of photographs; every tenth is kept for validation. None: procedural textures.
     init : path, optional
-        What to start from, see :func:`initial_weights`.
+        What to start from, see :func:`initial_weights`; a checkpoint that is resumed has weights of its own.
     resume_run : bool
         Go on from the checkpoint in ``out``.
     minutes : float, optional
@@ -298,8 +309,8 @@ def train(
         Processes that make samples; 0: none but this one.
     threads : int, optional
         Threads of torch.
-    save_every, validate_every : float
-        Minutes between checkpoints, and between validations.
+    validate_every : float
+        Minutes between validations.
     validation_images : int
         Whole images that are validated on, each with and without deteriorations; see :func:`validation_set`.
     tensorboard : bool
@@ -374,7 +385,7 @@ def train(
                 sums.zero_()
                 noted, since = now, state.step
             last = stop or state.step == recipe.steps
-            if rank == 0 and (last or now - saved > 60 * save_every):
+            if rank == 0 and (last or now - saved > 60 * SAVE_EVERY):
                 save_checkpoint(state, checkpoint, designs)
                 saved = now
             if validation and (last or now - validated > 60 * validate_every):
@@ -401,14 +412,16 @@ def _begin_from(
     theirs = replace(sizes or recipe.network, ids=recipe.network.ids)
     given = network if theirs == recipe.network else start(replace(recipe, network=theirs), device).network
     line = initialise(given, weights, str(init))
+    if not is_folded(weights) and given is network:
+        return line
+    photos = load_photos(backgrounds, "training")
+    width, height = recipe.samples.size
+    count = max(2, min(128, 128 * 96 * 96 // (width * height)))
+    batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, count, recipe.phase(0)[1])
+    images = _blob(torch.from_numpy(batch.images).to(device))
     if is_folded(weights):
-        photos = load_photos(backgrounds, "training")
-        batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, 128, recipe.phase(0)[1])
-        images = _blob(torch.from_numpy(batch.images).to(device))
         unfold(given, images)
-        if given is not network:
-            line = grow(network, given, images, str(init))
-    return line
+    return line if given is network else f"{line}; {grow(network, given, images, str(init))}"
 
 
 def _place() -> tuple[int, int, torch.device]:

@@ -27,7 +27,7 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from kpbench.errors import DataError
 
-__all__ = ["Progress", "cores", "dask_executor", "one_blas_thread", "one_thread", "run_pieces"]
+__all__ = ["Progress", "cores", "dask_executor", "end_with_parent", "one_blas_thread", "one_thread", "run_pieces"]
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -178,14 +178,19 @@ def _start_worker(counter: Any) -> None:
     one_thread()
     with contextlib.suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
 
 
-def _end_with_parent() -> None:
+def end_with_parent() -> None:
+    """Let this worker process end when its parent has, however that came."""
     parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+
+    def wait_for_it() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait_for_it, daemon=True).start()
 
 
 def _count(images: int) -> None:

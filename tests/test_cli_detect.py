@@ -1,3 +1,4 @@
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -7,10 +8,13 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.design import load_patches
-from kpbench.detect import load_detector
+from kpbench.detect import LoadedDetector, load_detector
 from kpbench.generation import generate
+from kpbench.keypoints import Detections
+from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
 from kpbench.scene import Limits
+from kpbench.sources import Source
 from kpbench.synth import SynthConfig
 
 MODULE = """
@@ -128,6 +132,18 @@ def test_a_video_and_its_overlay(folder, plug):
     assert len(x) == 5
     assert (np.abs(x - (15 + 8 * np.arange(5))) <= 8).all()
     assert cv2.VideoCapture("out.mp4").get(cv2.CAP_PROP_FRAME_COUNT) == 5
+
+
+@pytest.mark.parametrize("length", [3, None])
+def test_an_interrupt_keeps_what_an_endless_source_has_shown(length):
+    def images():
+        yield "0.png", np.zeros((8, 8), np.uint8)
+        raise KeyboardInterrupt
+
+    source = Source(images(), length)
+    detector = LoadedDetector("none", "1", lambda image: Detections.none())
+    with nullcontext() if length is None else pytest.raises(KeyboardInterrupt):
+        assert len(predict_images(source, detector).predictions) == 1
 
 
 def test_an_image_that_fails_is_named_and_counted_and_the_rest_goes_on(folder, plug):

@@ -99,11 +99,22 @@ def test_a_grown_network_computes_what_the_smaller_one_does(down):
     network = SuperPoint(NetworkConfig((6, 4, 12, 16), (2, 2, 1, 3), down, 12, 8)).eval()
     images = torch.rand(4, 1, 40, 56)
     line = grow(network, smaller, images, "small.onnx")
-    assert line == "small.onnx: taken into a larger network; convolutions that pass on: 3, left out: 0"
+    assert line == "taken into another network, convolutions that pass on: 3, left out: 0"
     with torch.no_grad():
         for mine, theirs in zip(network(images), smaller(images), strict=True):
             assert theirs.std() > 0.01
             torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-4)
+
+
+def test_convolutions_beyond_a_stages_depth_are_left_out_whatever_halves():
+    smaller = SuperPoint(NetworkConfig((4, 4, 8, 8), (1, 2, 2, 4), "stride", 8, 8)).eval()
+    network = SuperPoint(NetworkConfig((6, 4, 12, 8), (2, 2, 1, 2), "max", 12, 8)).eval()
+    line = grow(network, smaller, torch.rand(4, 1, 40, 56), "small.onnx")
+    assert line == "taken into another network, convolutions that pass on: 1, left out: 3"
+    for stage, layer in ((0, 0), (1, 0), (1, 1), (2, 0), (3, 0), (3, 1)):
+        own, theirs = (net.backbone[stage][layer].conv.weight for net in (network, smaller))
+        assert torch.equal(own[: len(theirs), : theirs.shape[1]], theirs)
+        assert not own[: len(theirs), theirs.shape[1] :].any()  # what is new is not listened to
 
 
 @pytest.mark.parametrize(
@@ -113,7 +124,7 @@ def test_a_grown_network_computes_what_the_smaller_one_does(down):
         ({"descriptor_width": 4}, "small.onnx: descriptor.1 is 8 wide, expected at most 4"),
         (
             {"norm": "after"},
-            "small.onnx: has other sizes than [network], and can grow only where norm is 'before' in both",
+            "small.onnx: differs from [network], and can grow only where norm is 'before' in both",
         ),
     ],
 )
@@ -131,6 +142,12 @@ def test_a_damaged_weights_file_is_one_line(tmp_path, suffix, content):
     with pytest.raises(DataError, match=r"weights\.\w+: cannot be read as weights") as caught:
         read_weights(path)
     assert "\n" not in str(caught.value)
+
+
+def test_a_pickle_of_other_keys_is_one_line(tmp_path):
+    torch.save({0: torch.zeros(1)}, tmp_path / "a.pth")
+    with pytest.raises(DataError, match=r"a\.pth: holds no state-dict"):
+        read_weights(tmp_path / "a.pth")
 
 
 class Harm:

@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from kpbench.crops import Disc, _paint_all, _poses
 from kpbench.design import shipped_patches
+from kpbench.errors import DataError
 from kpbench.geometry import projected_disc
 from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
 from kpbench.scene import Limits, Placement
@@ -110,3 +111,12 @@ def test_every_tenth_photograph_is_kept_for_validation(tmp_path):
 def test_large_photographs_are_kept_at_640_px(tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((100, 1280), np.uint8))
     assert load_photos(tmp_path, "training")[0].shape == (50, 640)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_photographs_that_cannot_be_used_are_one_line(tmp_path, workers):
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((50, 60), np.uint8))
+    cv2.imwrite(str(tmp_path / "1.png"), np.zeros((5, 5), np.uint8))  # smaller than any window
+    cv2.imwrite(str(tmp_path / "2.png"), np.zeros((8, 2000), np.uint8))  # and so are 640 columns of it
+    with pytest.raises(DataError, match="none of the 2 photographs for training can be decoded"):
+        list(stream(SampleConfig(), shipped_patches(), tmp_path, 0, [Job(0, 2, 0.0)], workers))

@@ -16,6 +16,7 @@ from kpbench import train as training
 from kpbench.design import shipped_patches
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
+from kpbench.export import export
 from kpbench.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
 from kpbench.samples import Batch, SampleConfig
 
@@ -76,7 +77,11 @@ def test_interrupted_and_resumed_equals_undisturbed_to_the_bit(tmp_path, run, st
     ("head_width", "line"),
     [
         (128, "30 tensors matched; not in it: nothing"),
-        (144, "taken into a larger network; convolutions that pass on: 0, left out: 0"),
+        (
+            144,
+            "30 tensors matched; not in it: nothing; "
+            "taken into another network, convolutions that pass on: 0, left out: 0",
+        ),
     ],
 )
 def test_shipped_weights_are_trained_on_from_what_they_find(tmp_path, run, head_width, line):
@@ -100,6 +105,28 @@ def test_other_designs_leave_out_the_id_head_of_an_exported_file():
     assert "descriptor_attached.weight" not in weights
     with pytest.raises(DataError, match="cannot be read as an ONNX model"):
         training.initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
+
+
+def test_a_checkpoint_is_trained_on_grown_and_for_other_designs_without_its_id_head(tmp_path, run):
+    run(RECIPE, tmp_path / "first")
+    first = tmp_path / "first" / "checkpoint.safetensors"
+    said = []
+    run(RECIPE, tmp_path / "same", init=first, say=said.append)
+    run(RECIPE, tmp_path / "others", init=first, say=said.append, patches=shipped_patches()[::-1])
+    run(replace(RECIPE, network=replace(TINY, head_width=16)), tmp_path / "wider", init=first, say=said.append)
+    assert [line.removeprefix(f"{first}: ") for line in said] == [
+        "52 tensors matched; not in it: nothing",
+        "50 tensors matched; not in it: descriptor_attached",
+        "52 tensors matched; not in it: nothing; taken into another network, convolutions that pass on: 0, left out: 0",
+    ]
+
+
+def test_an_exported_file_whose_batchnorm_is_lost_is_refused(tmp_path, run):
+    after = replace(RECIPE, network=replace(TINY, norm="after"))
+    run(after, tmp_path)
+    export(tmp_path / "checkpoint.safetensors", tmp_path / "a.onnx")
+    with pytest.raises(DataError, match=r"a\.onnx: its BatchNorm, .* cannot be put back; start from its checkpoint"):
+        training.initial_weights(tmp_path / "a.onnx", shipped_patches())
 
 
 def test_worker_processes_change_nothing(tmp_path, run):
@@ -182,6 +209,10 @@ def test_shipped_recipes_survive_the_checkpoint(path):
         ("name = 'a'\nphases = []\n[network]\nwidths = [1, 2]", r"network\.widths is \[1, 2\], expected a list of 4"),
         ("name = 'a'\nphases = []\n[network]\nwidths = [0, 2, 3, 4]", "expected four positive numbers each"),
         ("name = 'a'\nphases = []", "expected at least one phase"),
+        ("name = 'a'\nphases = [{ samples = 63 }]", "all have fewer samples than one batch, expected at least 64"),
+        ("name = 'a'\nphases = []\nlr = nan", "lr is nan, expected a number from 0"),
+        ("name = 'a'\nphases = []\n[samples]\nsize = [100, 96]", r"size \[100, 96\] .*, expected multiples of 8"),
+        ("name = 'a'\nphases = []\n[samples]\nset_size = 0", "set_size 0, expected .* at least 1"),
         ("name = ", "not valid TOML"),
     ],
 )
@@ -297,5 +328,6 @@ def test_an_interrupt_ends_after_the_step_with_a_checkpoint_that_resumes(tmp_pat
         with pytest.raises(KeyboardInterrupt, match="is at step 3; the same command with --resume goes on"):
             run(RECIPE, tmp_path / "parts")
     assert signal.getsignal(signal.SIGINT) is before  # ignored, not the default, in a shell's background job
-    assert run(RECIPE, tmp_path / "parts", resume_run=True)
+    # "the same command", whatever that started from
+    assert run(RECIPE, tmp_path / "parts", resume_run=True, init="superpoint-small")
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))

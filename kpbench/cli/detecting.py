@@ -28,7 +28,7 @@ __all__ = ["detect"]
 @click.option(
     "--threshold",
     type=FINITE,
-    help="Least score of a detection; default: the detector's own, 0.5 of superpoint-small, 0.3 of template.",
+    help="Least score of a detection; default: the detector's own, 0.3 of those that ship.",
 )
 @click.option(
     "--overlay",

@@ -24,7 +24,7 @@ INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
     help="Weights to start from: superpoint-small (the shipped ones), an exported .onnx, a checkpoint, or SuperPoint's "
     "(.pth, .safetensors).",
 )
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder.")
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder, whatever --init says.")
 @click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
 @click.option("--workers", type=click.IntRange(min=0), default=1, show_default=True, help="Processes making samples.")
 @click.option("--threads", type=click.IntRange(min=1), help="Threads of PyTorch.")
@@ -49,8 +49,6 @@ def train(
       kpbench train --config configs/reference.toml --backgrounds photos/ --resume
       torchrun --nproc-per-node 4 -m kpbench train --config configs/reference.toml --workers 4
     """
-    if init and resume:
-        raise click.UsageError("--init and --resume exclude each other: a checkpoint holds its own weights")
     from kpbench.design import load_patches, shipped_patches
     from kpbench.recipe import load_recipe
 
