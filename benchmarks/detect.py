@@ -1,12 +1,11 @@
 """How long the whole detect step takes, against PyTorch eager float32 of the plain SuperPoint.
 
-    python benchmarks/detect.py DATASET [--images 20] [--superpoint FILE.onnx]
+    python benchmarks/detect.py DATASET [--images 20]
 
 For each detector, one image at a time, medians over the images: the network at all scales that it looks at; that with
 its decoding, which gives places; the whole step, with verification by the designs; and the step without it, at one
 scale. The rival is SuperPoint's network of the paper's size (64-64-128-128, 256) with random weights in PyTorch, the
 network alone: its decoding is not counted. Runs are interleaved, so that a machine that slows down slows all.
-`--superpoint` times a full-size model too.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -31,16 +29,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("dataset")
     parser.add_argument("--images", type=int, default=20)
-    parser.add_argument("--superpoint")
     options = parser.parse_args()
     dataset = kpbench.open_dataset(options.dataset)
     images = [to_grey(dataset.image(n)) for n in range(min(options.images, len(dataset)))]
     detectors: dict[str, tuple[SuperPointDetector, SuperPointDetector]] = {
-        "superpoint-small": (SmallSuperPointDetector(), SmallSuperPointDetector(verified=False))
+        "superpoint-small": (SmallSuperPointDetector(), SmallSuperPointDetector(verified=False)),
+        "superpoint": (SuperPointDetector(), SuperPointDetector(verified=False)),
     }
-    if options.superpoint:
-        path = Path(options.superpoint)
-        detectors["superpoint"] = SuperPointDetector(path), SuperPointDetector(path, verified=False)
     torch.set_num_threads(kpbench.workers.cores())
     rival = SuperPoint(NetworkConfig()).eval()
     steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}

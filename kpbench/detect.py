@@ -27,6 +27,7 @@ __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress
 
 DETECTORS = {
     "template": "kpbench.detectors.template:TemplateDetector",
+    "superpoint": "kpbench.detectors.superpoint:SuperPointDetector",
     "superpoint-small": "kpbench.detectors.superpoint:SmallSuperPointDetector",
     "orb": "kpbench.detectors.features:orb",
     "sift": "kpbench.detectors.features:sift",
@@ -35,7 +36,6 @@ DETECTORS = {
     "charuco": "kpbench.detectors.tags:CharucoDetector",
 }
 """Name → where the shipped detector is, as ``MODULE:ATTR``."""
-SUPERPOINT = "kpbench.detectors.superpoint:SuperPointDetector"
 
 PROGRAM = "program:"
 """What the name of a detector begins with that is a program, see :func:`kpbench.program.run_program`."""
@@ -109,7 +109,7 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
         many = partial(run_program, name.removeprefix(PROGRAM).strip())
         return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
     if name.endswith(".onnx"):
-        made = _with(threshold, _resolve(SUPERPOINT)(Path(name)))
+        made = _with(threshold, _resolve(DETECTORS["superpoint"])(Path(name)))
         return LoadedDetector(Path(name).stem, made.version, made.detect)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(

@@ -134,7 +134,7 @@ def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[st
     """A state-dict to start from, and the sizes of its network where they are told.
 
     Published SuperPoint weights, the running mean of a checkpoint, or an ONNX file of ``kpbench export-model``,
-    ``superpoint-small`` being the one that ships. An ID head for other designs is left out.
+    ``superpoint`` and ``superpoint-small`` being those that ship. An ID head for other designs is left out.
     """
     path = _shipped(path)
     if path.suffix == ".onnx":

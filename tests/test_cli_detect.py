@@ -102,7 +102,7 @@ def test_a_threshold_takes_the_place_of_the_detectors_own(folder, plug):
         assert f"{count} detections" in run("photos", "--detector", f"{plug}:Unsure", *threshold).stdout
 
 
-@pytest.mark.parametrize("name", ["template", "superpoint-small"])
+@pytest.mark.parametrize("name", ["template", "superpoint", "superpoint-small"])
 def test_the_shipped_detectors_have_a_threshold(name):
     assert load_detector(name, 0.9).run.__self__.threshold == 0.9
 

@@ -67,7 +67,7 @@ def detect(
     detector = _told(name, patches, threshold) if patches else name
     if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
         dataset = open_dataset(source)
-        if not patches and name in ("template", "superpoint-small") and _others(dataset.config):
+        if not patches and name in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
             click.echo(
                 f"kpbench: {source} holds other designs than {name} looks for; use template with --patches, "
                 "or weights trained on them",

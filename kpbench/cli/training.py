@@ -21,8 +21,8 @@ INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
 @click.option(
     "--init",
     type=click.Path(path_type=Path),
-    help="Weights to start from: superpoint-small (the shipped ones), an exported .onnx, a checkpoint, or SuperPoint's "
-    "(.pth, .safetensors).",
+    help="Weights to start from: superpoint or superpoint-small (those that ship), an exported .onnx, a checkpoint, "
+    "or SuperPoint's (.pth, .safetensors).",
 )
 @click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder, whatever --init says.")
 @click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
