@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from kpbench.charts import STYLE, Series, line_chart
+from kpbench.charts import COLOURS, STYLE, Series, line_chart
 from kpbench.metrics import LABELS
 from kpbench.paper import PAPER
 from kpbench.tables import Cell, Estimate, Table, to_markdown
@@ -158,7 +158,7 @@ def figure(runs: list[dict[str, Any]]) -> str:
     names = [*((n + (n >= PAPER_STYLE), run["detector"]["name"]) for n, run in enumerate(runs))]
     names.append((PAPER_STYLE, "the paper, photographs (dashed); all others: simulated"))
     legend = "".join(
-        f'<circle class="s{style % 8}" cx="60" cy="{30 + 26 * row}" r="6"/>'
+        f'<circle class="s{style % COLOURS}" cx="60" cy="{30 + 26 * row}" r="6"/>'
         f'<text x="78" y="{34 + 26 * row}">{name}</text>'
         for row, (style, name) in enumerate(names)
     )

@@ -13,12 +13,12 @@ from typing import TypeVar
 
 __all__ = ["COLOURS", "STYLE", "Series", "bar_chart", "line_chart", "standalone"]
 
-COLOURS = 8  # classes s0 … s7; more series start again, dashed
+COLOURS = 9  # classes s0 … s8; more series start again, dashed
 # Readable on white and on near-black and apart to colour-blind eyes; after Okabe and Ito 2008
 STYLE = """\
-:root{--s0:#0067a8;--s1:#c2410c;--s2:#00795a;--s3:#8d5fc4;--s4:#a16207;--s5:#be185d;--s6:#3f7f93;--s7:#5b6470}
+:root{--s0:#0067a8;--s1:#c2410c;--s2:#00795a;--s3:#8d5fc4;--s4:#a16207;--s5:#be185d;--s6:#3f7f93;--s7:#5b6470;--s8:#6f4518}
 @media (prefers-color-scheme:dark){:root{--s0:#5cb3ec;--s1:#f59361;--s2:#3fc79a;--s3:#c3a2f0;--s4:#e0b13c;--s5:#f283b3;\
---s6:#8ccbdd;--s7:#aab3bf}}
+--s6:#8ccbdd;--s7:#aab3bf;--s8:#cf9f6e}}
 svg.chart{font:12px system-ui,sans-serif;color:inherit;width:100%;max-width:600px;height:auto;display:block}
 .chart text{fill:currentColor}.chart .grid{stroke:currentColor;stroke-opacity:.15}
 .chart .axis{stroke:currentColor;stroke-opacity:.5}.chart polyline{fill:none;stroke-width:2;stroke-linejoin:round}
