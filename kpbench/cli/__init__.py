@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import os
 import sys
 
 import click
@@ -58,6 +60,8 @@ class LazyGroup(click.Group):
             sys.exit(1)
         except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
             click.echo(f"kpbench: {error.strerror or error}", err=True)
+            with contextlib.suppress(OSError, ValueError):  # or Python tries once more at its end, and exits with 120
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
             click.echo(f"kpbench: interrupted{f': {stop}' if str(stop) else ''}", err=True)
