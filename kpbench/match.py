@@ -1,16 +1,13 @@
-"""Compare places in an image with designs, coarse to fine: pose, and how far the pattern reaches.
+"""Compare places in an image with designs.
 
 Each step looks at many candidates at once:
 
-* :func:`search` finds the pose where only a rough place and scale are known: it samples the image on
-  circles around the place, under a bank of tilts, and correlates with every design in every rotation;
 * :func:`turn` finds the rotation where the ellipse is known (:func:`surroundings` shows what tells it);
 * :func:`align` moves a pose onto the image (inverse compositional Gauss-Newton, Baker and Matthews,
-  *Lucas-Kanade 20 years on*, IJCV 2004);
-* :func:`extend` measures how far the sectors reach, which is the patch's size;
+  *Lucas-Kanade 20 years on*, IJCV 2004), by the whole design or by its innermost sectors;
 * :func:`view` shows the image in the frame of the patch.
 
-Search and alignment can look at the innermost sectors alone, which are the same at every size.
+Where not even the ellipse is known :mod:`kpbench.sectors` finds it.
 Poses are affine: ``x_px = xy + A @ u``.
 """
 
@@ -24,13 +21,11 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from kpbench.design import Patch
 from kpbench.keypoints import Float, UInt8
 
 __all__ = [
-    "RING_PX",
     "Bank",
     "Picture",
     "Poses",
@@ -38,11 +33,15 @@ __all__ = [
     "align",
     "bank",
     "blurred",
-    "extend",
-    "likeness",
+    "coarsest_level",
+    "look_up",
+    "normalise",
+    "outside_image",
     "pyramid",
-    "search",
+    "rotated",
+    "sample",
     "short_axis",
+    "soft_ink",
     "surroundings",
     "turn",
     "view",
@@ -58,8 +57,6 @@ AS_LIKELY, UNLIKE = 0.15, 0.5
 """How much less a second rotation may correlate with the image, and how little it must with the best one."""
 SIZES = (0.8, 0.9, 1.1)
 """Other sizes of an ellipse in which its design is turned: rings, and what lies around, make it too large or small."""
-RING_PX = 3.0
-"""Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 WHOLE_PX = 5.6
 """The whole design is compared in the coarsest level in which its short semi-axis measures as much."""
 _turn = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -132,21 +129,21 @@ def bank(patches: Sequence[Patch]) -> Bank:
 def _bank(patches: tuple[Patch, ...]) -> Bank:
     core = _templates(patches, (0.4, 0.7, 1.0), whole=False)
     whole = _templates(patches, (0.25, 0.45, 0.65, 0.85), whole=True)
-    picture = np.array([_look_up(_soft_ink(patch, True), _view_points()) for patch in patches], np.float32)
+    picture = np.array([look_up(soft_ink(patch, True), _view_points()) for patch in patches], np.float32)
     return Bank(patches, core, whole, picture)
 
 
 def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
     points = np.concatenate([r * _circle for r in rings])
-    pairs = [_template(_soft_ink(patch, whole), points) for patch in patches]
+    pairs = [_template(soft_ink(patch, whole), points) for patch in patches]
     ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
     turned, which, angle, turns = [], [], [], TURNS if whole else ANGLES
     for n, patch in enumerate(patches):
-        image = _soft_ink(patch, whole)
+        image = soft_ink(patch, whole)
         seen: list[Float32] = []
         for turn in np.arange(turns) * (2 * np.pi / turns):
             c, s = np.cos(turn), np.sin(turn)
-            grey = _look_up(image, points @ np.array([[c, -s], [s, c]]))
+            grey = look_up(image, points @ np.array([[c, -s], [s, c]]))
             one = ((grey - grey.mean()) / np.linalg.norm(grey - grey.mean())).astype(np.float32)
             if all(one @ other < 0.998 for other in seen):
                 seen.append(one)
@@ -160,8 +157,8 @@ def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) ->
 def _template(image: Float32, points: Float) -> tuple[Float, Float]:
     """Normalised template and its Gauss-Newton solver."""
     step = 0.05
-    ink = _look_up(image, points)
-    du, dv = ((_look_up(image, points + s) - _look_up(image, points - s)) / (2 * step) for s in np.eye(2) * step)
+    ink = look_up(image, points)
+    du, dv = ((look_up(image, points + s) - look_up(image, points - s)) / (2 * step) for s in np.eye(2) * step)
     u, v = points.T
     jacobian = np.column_stack([du, dv, du * u, du * v, dv * u, dv * v])
     ink = ink - ink.mean()
@@ -180,7 +177,7 @@ SOFT_CORE, SOFT_WHOLE = 0.2, 0.12
 
 
 @lru_cache(maxsize=64)
-def _soft_ink(patch: Patch, whole: bool) -> Float32:
+def soft_ink(patch: Patch, whole: bool) -> Float32:
     """Ink, white 1 and black -1, over [-1.7, 1.7]²: the design, or its innermost sectors without end; blurred."""
     fine = 3
     ticks = ((np.arange(LOOKUP_SIZE * fine) + 0.5) / (LOOKUP_SIZE * fine) * 2 - 1) * LOOKUP_HALF
@@ -194,7 +191,8 @@ def _soft_ink(patch: Patch, whole: bool) -> Float32:
     return np.asarray(cv2.GaussianBlur(ink.astype(np.float32), (0, 0), blur))
 
 
-def _look_up(image: Float32, points: Float) -> Float:
+def look_up(image: Float32, points: Float) -> Float:
+    """Ink (N,) of :func:`soft_ink` at points (N, 2)."""
     at = ((points + LOOKUP_HALF) / (2 * LOOKUP_HALF) * LOOKUP_SIZE - 0.5).astype(np.float32)
     return np.asarray(cv2.remap(image, at[:, :1], at[:, 1:], cv2.INTER_LINEAR), np.float64).ravel()
 
@@ -224,22 +222,18 @@ class Picture:
 
     def __init__(self, grey: UInt8) -> None:
         self.raw, self.smooth = pyramid(grey, 0), pyramid(grey)
-        kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32) / 6
-        self.noise = 1.4826 * float(np.median(np.abs(cv2.filter2D(self.raw[0], cv2.CV_32F, kernel)[::2, ::2])))
+        kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
+        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # of whole numbers the median takes less time
+        self.noise = 1.4826 / 6 * float(np.median(np.abs(differences)))
         dark, bright = np.percentile(grey[::4, ::4], (2, 98))
         self.range = float(bright - dark)
-
-
-def likeness(core: Float, whole: Float) -> Float:
-    """What the correlations near the centre and over the disc are worth, in units of log odds."""
-    return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
 
 
 MOST_ROWS = 2**14
 """Rows that are sampled at once: OpenCV's remap takes fewer than 2**15."""
 
 
-def _sample(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, points: Float) -> Float32:
+def sample(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, points: Float) -> Float32:
     """Bilinear grey values (N, M) at ``xy + A @ points`` px of the image, each row from a level of its own."""
     values = np.empty((len(xy), len(points)), np.float32)
     fan = points.T.astype(np.float32)
@@ -252,7 +246,7 @@ def _sample(levels: Sequence[Float32], level: Ints, xy: Float, A: Float, points:
     return values
 
 
-def _outside(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Ints, NDArray[np.bool_]]:
+def outside_image(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Ints, NDArray[np.bool_]]:
     """Rows that have samples outside the image, and which ones: (K,) and (K, M)."""
     last = np.array(image.shape[::-1]) - 1.0
     reach = np.linalg.norm(A, axis=2) * np.linalg.norm(points, axis=1).max()
@@ -265,7 +259,7 @@ FLOOR = 1.0
 """Grey levels; a standard deviation around a place that is under it counts as nothing."""
 
 
-def _normalise(values: Float32) -> Float32:
+def normalise(values: Float32) -> Float32:
     """Zero mean and unit norm a row."""
     centred = values - values.mean(axis=1, keepdims=True)
     size = np.einsum("nm,nm->n", centred, centred) + np.float32(FLOOR**2 * values.shape[1])
@@ -277,51 +271,6 @@ def short_axis(A: Float) -> Float:
     square = np.einsum("nij,nij->n", A, A)
     det = np.abs(A[:, 0, 0] * A[:, 1, 1] - A[:, 0, 1] * A[:, 1, 0])
     return np.asarray(np.sqrt(np.maximum(square - np.sqrt(np.maximum(square**2 - 4 * det**2, 0)), 0) / 2))
-
-
-@lru_cache(maxsize=1)
-def _tilts() -> Float:
-    """Affine maps (K, 2, 2) whose circle has a short semi-axis of 1: long ones of 1 to 4.5 in all directions."""
-    maps = []
-    for ratio, directions in ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9)):
-        for direction in np.arange(directions) * np.pi / directions:
-            c, s = np.cos(direction), np.sin(direction)
-            axes = np.array([[c, -s], [s, c]])
-            maps.append(axes @ np.diag([1 / ratio, 1.0]) @ axes.T)
-    return np.array(maps)
-
-
-def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margin: float) -> Poses:
-    """Best tilt and rotation of each design at each place.
-
-    Parameters
-    ----------
-    levels : from :func:`pyramid`.
-    xy : (N, 2) px.
-    level : (N,) pyramid level to look at; the circle has a short semi-axis of ``3 · 2^level`` px.
-    known : the designs.
-    margin : designs whose correlation is worse by more than this than the best one's are left out.
-
-    Returns
-    -------
-    Poses
-        One to D a place, in the order of the places (all D where ``margin`` is infinite);
-        ``A`` maps the unit circle of ``known.core``.
-    """
-    core, scale = known.core, RING_PX * 2.0**level
-    starts = np.searchsorted(core.turned_which, np.arange(len(known.patches)))
-    best = np.full((len(known.patches), len(xy)), -1.0, np.float32)
-    tilt = np.zeros(best.shape, np.int64)
-    for k, map_ in enumerate(_tilts()):
-        values = _sample(levels, level, xy, scale[:, None, None] * map_, core.points)
-        value = np.maximum.reduceat(core.turned @ _normalise(values).T, starts, axis=0)
-        better = value > best
-        best[better], tilt[better] = value[better], k
-    place, which = np.nonzero((best >= best.max(axis=0) - margin).T)
-    A = scale[place, None, None] * _tilts()[tilt[which, place]]
-    ncc = _normalise(_sample(levels, level[place], xy[place], A, core.points)) @ core.turned.T
-    best = np.where(core.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
-    return _turned(xy[place], A, which, best, ncc, core)
 
 
 def turn(
@@ -355,20 +304,20 @@ def turn(
     row = np.concatenate([every, again])
     order = np.argsort(row, kind="stable")
     row, turned = row[order], np.concatenate([first, second[again]])[order]
-    return row, _turned(xy[row], found[row], which[row], turned, ncc[row], whole)
+    return row, rotated(xy[row], found[row], which[row], turned, ncc[row], whole)
 
 
 def _turns(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, whole: Templates) -> Float32:
     """Correlations (N, R) of ellipses with all rotations; -inf for those of other designs than ``which``."""
-    values = _sample(levels, _level(short_axis(A), WHOLE_PX, levels), xy, A, whole.points)
-    ncc = _normalise(values) @ whole.turned.T
-    cut, outside = _outside(levels[0], xy, A, whole.points)
+    values = sample(levels, coarsest_level(short_axis(A), WHOLE_PX, levels), xy, A, whole.points)
+    ncc = normalise(values) @ whole.turned.T
+    cut, outside = outside_image(levels[0], xy, A, whole.points)
     ncc[cut] = _partial_ncc(values[cut], ~outside, whole.turned)
     ncc[whole.turned_which != which[:, None]] = -np.inf
     return ncc
 
 
-def _turned(xy: Float, A: Float, which: Ints, turned: Ints, ncc: Float32, templates: Templates) -> Poses:
+def rotated(xy: Float, A: Float, which: Ints, turned: Ints, ncc: Float32, templates: Templates) -> Poses:
     """Poses in rotations (N,) of their design, with their correlations out of ``ncc`` (N, R)."""
     angle = templates.turned_angle[turned]
     c, s = np.cos(angle), np.sin(angle)
@@ -405,8 +354,8 @@ def align(levels: Sequence[Float32], poses: Poses, templates: Templates, steps: 
     xy, A, which = poses.xy, poses.A, poses.which
     ink, solve, sized = templates.ink[which], templates.solve[which], templates.sized[which]
     for step in range(steps + 1):
-        values = _sample(levels, _level(short_axis(A), radius_px, levels), xy, A, templates.points)
-        ncc, residual = _compare(values, ink, *_outside(levels[0], xy, A, templates.points))
+        values = sample(levels, coarsest_level(short_axis(A), radius_px, levels), xy, A, templates.points)
+        ncc, residual = _compare(values, ink, *outside_image(levels[0], xy, A, templates.points))
         if step == steps:
             break
         delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
@@ -424,7 +373,7 @@ def _compare(values: Float32, ink: Float32, cut: Ints, outside: NDArray[np.bool_
 
     Samples outside the image (of the rows ``cut``) are left out of the one and are zero in the other.
     """
-    scaled = _normalise(values)
+    scaled = normalise(values)
     ncc = np.einsum("nm,nm->n", scaled, ink)
     residual = scaled / np.maximum(ncc, 0.3)[:, None] - ink
     if len(cut):
@@ -443,7 +392,7 @@ def _compare(values: Float32, ink: Float32, cut: Ints, outside: NDArray[np.bool_
     return ncc, residual
 
 
-def _level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Ints:
+def coarsest_level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Ints:
     """The coarsest pyramid level in which a radius still measures ``least_px``."""
     octave = np.floor(np.log2(np.maximum(radius_px, 1e-6) / least_px))
     return np.clip(octave, 0, len(levels) - 1).astype(np.int64)
@@ -470,8 +419,8 @@ def view(levels: Sequence[Float32], xy: Float, A: Float, which: Ints, known: Ban
     points = _view_points()
     px = short_axis(A) * 2 * LOOKUP_HALF / VIEW_PX
     level = np.clip(np.rint(np.log2(np.maximum(px, 1e-6))), 0, len(levels) - 1).astype(np.int64)
-    grey = _sample(levels, level, xy, A, points)
-    cut, outside = _outside(levels[0], xy, A, points)
+    grey = sample(levels, level, xy, A, points)
+    cut, outside = outside_image(levels[0], xy, A, points)
     grey[cut] = np.where(outside, np.nan, grey[cut])
     disc = np.hypot(*points.T) < 1
     part, model = grey[:, disc], known.picture[which][:, disc]
@@ -512,115 +461,5 @@ def surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = None) -
     grey = np.empty((len(xy), OCTAVES, len(points)), np.float32)
     for octave in range(OCTAVES):
         level = np.full(len(xy), min(octave, len(levels) - 1))
-        grey[:, octave] = _sample(levels, level, xy, A * 2.0**octave, points)
+        grey[:, octave] = sample(levels, level, xy, A * 2.0**octave, points)
     return grey.reshape(-1, OCTAVES, VIEW_PX, VIEW_PX)
-
-
-SPOKES = 40
-RADII = 0.7 * 1.12 ** np.arange(34)
-"""Radii at which :func:`extend` looks, in radii of the circle that was aligned."""
-AGREE = 0.7
-"""Fraction of a circle's samples that must have the predicted ink for it to belong to the patch."""
-
-
-def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
-    """How far the sectors reach: turn poses of the core into poses of the unit disc.
-
-    Each sample on the spokes of a wheel votes for or against the ink that the sectors predict; the ellipse
-    with the largest sum of votes is the sectors' edge. Two edges leave the stretch along each of them open,
-    so ellipses are tried that differ in it; three or more edges leave the size alone.
-    """
-    A = poses.A.copy()
-    for rows in np.split(np.arange(len(poses)), range(BLOCK, len(poses), BLOCK)):
-        # most places are no patch, and end at once
-        A[rows], ended = _reach(levels, poses[rows], known, NEAR)
-        far = rows[~ended]
-        A[far], _ = _reach(levels, poses[far], known, len(RADII))
-    return Poses(poses.xy, A, poses.which, poses.ncc)
-
-
-NEAR = 12
-"""Radii of a first look."""
-BLOCK = 2**11
-"""Poses at once: memory does not grow with the image."""
-
-
-def _reach(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> tuple[Float, NDArray[np.bool_]]:
-    """Maps (N, 2, 2) of the unit disc, looking at so many radii, and whether more of them would change nothing (N,)."""
-    votes = _votes(levels, poses, known, count)
-    summed = votes * (RADII * np.gradient(RADII)).astype(np.float32)[:count, None]
-    for ring in range(1, count):  # np.cumsum takes four times as long
-        summed[:, ring] += summed[:, ring - 1]
-    A, ended = poses.A.copy(), np.zeros(len(poses), bool)
-    for d, patch in enumerate(known.patches):
-        rows = np.flatnonzero(poses.which == d)
-        shapes, ends, certain = _ellipses(patch, count)
-        # (radii x spokes, rows) of what the votes add up to, those in favour, and all that were cast
-        tables = [t[rows].reshape(len(rows), count * SPOKES).T for t in (summed, votes > 0, votes != 0)]
-        total, yes, cast = (
-            (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), count) for t in tables
-        )
-        # beyond the first circle that disagrees, what agrees is chance
-        alien = np.logical_or.accumulate((yes < AGREE * cast) | (yes < 0.3 * SPOKES), axis=2)
-        alien[:, :, 0] = False
-        ended[rows] = alien[:, :, certain].all(axis=1)
-        best = np.where(alien, -np.inf, total).reshape(len(rows), len(shapes) * count).argmax(axis=1)
-        shape, size = np.unravel_index(best, (len(shapes), count))
-        A[rows] = A[rows] @ (shapes[shape] * RADII[size][:, None, None]) / patch.cells[0][1]
-    return A, ended
-
-
-def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> Float32:
-    """From -1.4 (the other ink) to 0.6 (the predicted ink), 0 outside the image: (N, radii, spokes)."""
-    spokes, radii = _spokes(), RADII[:count]
-    ink = np.array([_look_up(_soft_ink(p, False), spokes) for p in known.patches], np.float32)
-    predicted = ink[poses.which][:, None]
-    shape = (len(poses), len(radii), len(spokes))
-    xy = np.repeat(poses.xy, len(radii), axis=0)
-    A = (poses.A[:, None] * radii[:, None, None]).reshape(-1, 2, 2)
-    grey = _sample(levels, _level(short_axis(A), RING_PX, levels), xy, A, spokes).reshape(shape)
-    core = grey[:, radii <= 1.0].mean(axis=1)
-    light = predicted[:, 0] > 0
-    white = (core * light).sum(axis=1) / light.sum(axis=1)
-    black = (core * ~light).sum(axis=1) / (~light).sum(axis=1)
-    middle, half = (white + black) / 2, np.maximum((white - black) / 2, 1.0)
-    agree = grey - middle.astype(np.float32)[:, None, None]
-    agree *= np.sign(predicted) / half.astype(np.float32)[:, None, None]
-    np.clip(agree, -1, 1, out=agree)
-    agree -= np.float32(0.4)
-    votes: Float32 = agree * np.abs(predicted)
-    rows, outside = _outside(levels[0], xy, A, spokes)
-    votes.reshape(-1, len(spokes))[rows] *= ~outside
-    return votes
-
-
-@lru_cache(maxsize=64)
-def _ellipses(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
-    """Shapes (G, 2, 2) to try, samples where each ends (G x radii, radii x spokes), last radius at which all do."""
-    shapes = _stretches(patch)
-    reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spokes()), axis=2)
-    shift = np.rint(np.log(reach) / np.log(RADII[1] / RADII[0])).astype(np.int64)
-    ring = np.clip(np.arange(count)[:, None] + shift[:, None], 0, count - 1)  # (G, radii, spokes)
-    column = (ring * SPOKES + np.arange(SPOKES)).ravel()
-    row = np.repeat(np.arange(len(column) // SPOKES), SPOKES)
-    ends = csr_array((np.ones(len(column), np.float32), (row, column)), (row[-1] + 1, count * SPOKES))
-    return shapes, ends, max(count - 1 - int(shift.max()), 0)
-
-
-def _spokes() -> Float:
-    turn = np.arange(SPOKES) * (2 * np.pi / SPOKES)
-    return np.column_stack([np.cos(turn), np.sin(turn)])
-
-
-@lru_cache(maxsize=64)
-def _stretches(patch: Patch) -> Float:
-    """Maps (G, 2, 2) of the patch frame that leave the innermost edges where they are, of determinant 1."""
-    _, angles, black = patch.cells
-    edges = np.unique(np.round(angles[black[0] != np.roll(black[0], 1)] % 180.0, 6))
-    if len(edges) > 2:
-        return np.eye(2)[None]
-    first = edges[0] if len(edges) else 0.0
-    second = edges[1] if len(edges) == 2 else first + 90.0
-    basis = np.array([[np.cos(np.radians(a)), np.sin(np.radians(a))] for a in (first, second)]).T
-    growth = 1.2 ** np.arange(-5, 6)
-    return np.array([basis @ np.diag([g, 1 / g]) @ np.linalg.inv(basis) for g in growth])

@@ -31,6 +31,7 @@ LAYERS = [
     {"synth", "suite", "crops"},
     {"samples", "recipe"},
     {"match"},
+    {"sectors"},
     {"refine"},
     {"program", "runtime"},
     {"verify"},

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench import match
+from kpbench import match, sectors
 from kpbench.design import shipped_patches
 from kpbench.scene import Placement, render_scene
 
@@ -37,16 +37,16 @@ def test_any_pose_of_any_design_is_found_from_a_rough_place(number, radius, tilt
     xy, A = np.array([60.3, 59.6]), turn(first) @ np.diag([radius, radius * tilt]) @ turn(second)
     levels = match.pyramid(picture(number, A, xy))
     short = radius * tilt * PATCHES[number].cells[0][1]
-    coarse = int(np.clip(np.floor(np.log2(short / match.RING_PX)), 0, 3))
+    coarse = int(np.clip(np.floor(np.log2(short / sectors.RING_PX)), 0, 3))
     level = np.array([coarse, max(coarse - 1, 0)])  # at the coarser one the circle may touch the sectors' edge
     place = xy + A @ np.array(off) * PATCHES[number].cells[0][1]
-    poses = match.search(levels, np.tile(place, (2, 1)), level, KNOWN, margin=0.2)
-    poses = match.align(levels, poses, KNOWN.core, 5, 0.9 * match.RING_PX)
+    poses = sectors.search(levels, np.tile(place, (2, 1)), level, KNOWN, margin=0.2)
+    poses = match.align(levels, poses, KNOWN.core, 5, 0.9 * sectors.RING_PX)
     best = poses[np.array([poses.ncc.argmax()])]
     assert best.which[0] == number
     assert best.ncc[0] > 0.9
     assert np.linalg.norm(np.linalg.solve(A, best.xy[0] - xy)) < 0.1
-    whole = match.align(levels, match.extend(levels, best, KNOWN), KNOWN.whole, 4, 5.6)
+    whole = match.align(levels, sectors.extend(levels, best, KNOWN), KNOWN.whole, 4, 5.6)
     size = np.sqrt(np.abs(np.linalg.det(whole.A[0])) / np.abs(np.linalg.det(A)))
     assert 0.5 < size < 1.3  # the size is rough: the sectors' edge is seen through a shape off by a few per cent
     assert whole.ncc[0] > 0.85

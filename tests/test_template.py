@@ -147,5 +147,5 @@ def test_the_designs_are_not_written_into_the_code():
 def test_more_poses_than_remap_takes_at_once_are_sampled():
     levels = match.pyramid(procedural(np.random.default_rng(0), 64, 48), 0)
     xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
-    values = match._sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
+    values = match.sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
     assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()

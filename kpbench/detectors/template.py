@@ -4,8 +4,8 @@ Edges that meet at a point point at it, under any perspective. So the first stag
 asks of every pixel whether the gradients around it are square to the direction to it, and are of more than
 one direction (a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
 location of distinct points*, 1987). That needs no templates. The few hundred places that remain are
-compared with the designs (:mod:`kpbench.match`), coarse to fine, each stage on what the one before kept, and
-what is left is fitted (:mod:`kpbench.refine`).
+compared with the designs (:mod:`kpbench.sectors`, :mod:`kpbench.match`), coarse to fine, each stage on
+what the one before kept, and what is left is fitted (:mod:`kpbench.refine`).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import __version__, match, refine
+from kpbench import __version__, match, refine, sectors
 from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
@@ -111,7 +111,7 @@ class Candidates:
         relative_blur = np.minimum(self.fit.blur_px / np.maximum(match.short_axis(self.fit.A), 0.5), 1)
         evidence = (
             -12.55
-            + match.likeness(self.core, self.whole)
+            + sectors.likeness(self.core, self.whole)
             - 0.78 * np.log(np.minimum(unexplained, 3) + 0.02)
             - 16.64 * relative_blur
             + 2.46 * np.log(contrast / (self.range + 5))
@@ -168,15 +168,15 @@ class TemplateDetector:
         known = match.bank(self.patches)
         picture = match.Picture(grey)
         raw, smooth = picture.raw, picture.smooth
-        poses = match.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
+        poses = sectors.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
         poses = poses[poses.ncc > 0.62]
         for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
-            poses = match.align(smooth, poses, known.core, steps, 0.9 * match.RING_PX)
+            poses = match.align(smooth, poses, known.core, steps, 0.9 * sectors.RING_PX)
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
-        whole = match.align(smooth, match.extend(smooth, core, known), known.whole, 4, match.WHOLE_PX)
-        sure = match.likeness(core.ncc, whole.ncc) > LIKENESS
+        whole = match.align(smooth, sectors.extend(smooth, core, known), known.whole, 4, match.WHOLE_PX)
+        sure = sectors.likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
         return Candidates(whole.which, core.ncc, whole.ncc, fit, picture.noise, picture.range)
