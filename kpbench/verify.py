@@ -87,13 +87,13 @@ SURE = 0.0
 """... but for places that lie on a patch with these log odds: there all are."""
 TURNED_TWICE = -4.8
 """Log odds that an ellipse is a patch from which more sizes, and two rotations where both look alike, are tried."""
-EMPTY = -7.0
+EMPTY = -6.5
 """Log odds that an ellipse is a patch under which a place is left."""
-DIM = -6.0
+DIM = -5.0
 """Log odds at the first look under which there is no second one."""
-HOPELESS = -4.0
+HOPELESS = -3.5
 """Log odds before the fit under which a hypothesis is not worth one."""
-USUAL = 85
+USUAL = 70
 """About as many places as an image of 640x480 has that the judges were trained on: their odds hold for as many."""
 SAME = 0.2
 """Hypotheses of one design are one if their centres are nearer than this, in short semi-axes."""

@@ -159,7 +159,7 @@ def pad_to_cells(grey: UInt8) -> UInt8:
     return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
 
 
-CANDIDATE = 0.01
+CANDIDATE = 0.015
 """Least score of the network from which a place is worth verifying."""
 SCALES = (1.2, 0.5, 0.25)
 """Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
