@@ -1,6 +1,6 @@
 """Train the network of :func:`kpbench.verify.ellipses` on synthetic sets, and show what it gives on another set.
 
-    python benchmarks/ellipses.py DATASET ... --test DATASET [--write]
+    python benchmarks/ellipses.py DATASET ... --test DATASET [--go-on] [--write]
 
 The sets must come from photographs that are free for fitting: `kpbench synth --n 1600 --backgrounds training/`.
 The network sees the surroundings of a place in four octaves and says whether it lies on a patch, where the patch's
@@ -8,7 +8,8 @@ centre is and which ellipse it fills, whatever its design. It is shown the place
 (in sets of the designs that it knows), and others around every keypoint, all turned, mirrored and scaled at random.
 Its log odds are then scaled so that they hold for the places of the test set, of which most are on none.
 Prints for the test set, by radius, the share of centres within 0.1 and 0.2 of the major semi-axis, before and after,
-and of semi-axes within a tenth and a fifth. `--write` replaces `ellipse.onnx` of `kpbench/weights`.
+and of semi-axes within a tenth and a fifth. `--go-on` starts from the weights that ship (with `--epochs 0`: shows what
+they give); `--write` replaces them, `ellipse.onnx` of `kpbench/weights`.
 Needs `pip install 'kpbench[train]'`.
 """
 
@@ -18,17 +19,16 @@ import argparse
 import zlib
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from small_networks import affine, exported, log_of_map, one_cycle, trunk
+from small_networks import affine, exported, log_of_map, one_cycle, shipped, start_from_shipped, trunk
 from torch import nn
 from tqdm import tqdm
 
 import kpbench
-from kpbench import match, verify
+from kpbench import match
 from kpbench.detect import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.workers import cores, one_thread
@@ -128,6 +128,7 @@ def main() -> None:
     parser.add_argument("datasets", nargs="+")
     parser.add_argument("--test", required=True)
     parser.add_argument("--epochs", type=int, default=6)
+    parser.add_argument("--go-on", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(cores())
@@ -136,13 +137,13 @@ def main() -> None:
         for path in options.datasets:
             count = len(kpbench.open_dataset(path))
             parts += tqdm(pool.map(partial(places, path, True), range(count), chunksize=4), path, count, leave=False)
-        network = trained(_together(parts), options.epochs)
+        network = trained(_together(parts), options.epochs, options.go_on)
         count = len(kpbench.open_dataset(options.test))
         test = _together(list(pool.map(partial(places, options.test, False), range(count), chunksize=4)))
     calibrate(network, test)
     report(network, test, count)
     if options.write:
-        target = Path(verify.__file__).parent / "weights" / "ellipse.onnx"
+        target = shipped("ellipse")
         seen = [(some.float(),) for some in test[0][:4096].split(64)]
         target.write_bytes(exported(network, seen, ["surroundings"]))
         print(f"{target.name}: {target.stat().st_size} bytes")
@@ -152,10 +153,12 @@ def _together(parts: list[Places]) -> list[torch.Tensor]:
     return [torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)]
 
 
-def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
+def trained(data: list[torch.Tensor], epochs: int, go_on: bool) -> Ellipse:
     """Cross-entropy of the log odds, smooth L1 of shift and log map on patches; AdamW, one cycle of learning rates."""
     torch.manual_seed(0)
     network = Ellipse().to(memory_format=torch.channels_last)
+    if go_on:
+        start_from_shipped(network, "ellipse", (data[0][torch.randperm(len(data[0]))[:4096]].float(),))
 
     def loss(rows: torch.Tensor) -> torch.Tensor:
         around, on, shift, log_map = _mirrored(*(column[rows] for column in data))
@@ -168,7 +171,7 @@ def trained(data: list[torch.Tensor], epochs: int) -> Ellipse:
         )
 
     print(f"train on {len(data[0])} places, {data[1].float().mean():.0%} on patches")
-    one_cycle(network, loss, lambda: torch.randperm(len(data[0])), epochs, 256, 3e-3)
+    one_cycle(network, loss, lambda: torch.randperm(len(data[0])), epochs, 256, 2e-3 if go_on else 3e-3)
     return network
 
 

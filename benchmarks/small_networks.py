@@ -5,14 +5,18 @@ from __future__ import annotations
 import io
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import onnx
 import torch
+from onnx.numpy_helper import to_array
 from torch import nn
 from tqdm import tqdm
 
+from kpbench import verify
 from kpbench.export import quantise
+from kpbench.network import unfold
 
 BF16 = torch.cpu._is_avx512_bf16_supported()
 """Whether this processor computes in bfloat16, which then takes about half the time."""
@@ -51,8 +55,12 @@ def one_cycle(
 
     AdamW, one cycle of the learning rate (Smith and Topin, *Super-convergence*, 2019).
     """
-    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=2e-2)
+    network.eval()
     steps = epochs * (len(drawn()) // batch)
+    if not steps:
+        return
+    network.train()
+    optimizer = torch.optim.AdamW(network.parameters(), weight_decay=2e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, lr, total_steps=steps)
     with tqdm(total=steps, desc="train", leave=False) as progress:
         while progress.n < steps:
@@ -66,6 +74,37 @@ def one_cycle(
                 progress.update()
                 progress.set_postfix(loss=f"{value.item():.3f}", refresh=False)
     network.eval()
+
+
+def shipped(name: str) -> Path:
+    """The file of a network: ``ellipse``, ``posed`` or ``fitted``."""
+    return Path(verify.__file__).parent / "weights" / f"{name}.onnx"
+
+
+@torch.no_grad()
+def start_from_shipped(network: nn.Module, name: str, seen: tuple[torch.Tensor, ...]) -> None:
+    """Give a network the weights that ship, as near as their 7 bits are.
+
+    Each BatchNorm passes on what it gets, as its statistics stand on what is ``seen``.
+    """
+    graph = onnx.load(shipped(name)).graph
+    stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
+    weights = {key: torch.from_numpy(stored[key].copy()) for key in network.state_dict() if key in stored}
+    for node in graph.node:
+        if node.op_type == "DequantizeLinear" and node.input[0] in stored:
+            whole, scale, zero = (stored[part] for part in node.input)
+            each = (-1,) + (1,) * (whole.ndim - 1)
+            stored[node.output[0]] = (whole.astype(np.float32) - zero.reshape(each)) * scale.reshape(each)
+    convolutions = [node for node in graph.node if node.op_type == "Conv"]
+    layers = [node.name.split("/")[-2] for node in convolutions]
+    for layer, node in zip(layers, convolutions, strict=True):
+        weights[f"{layer}.weight"] = torch.from_numpy(stored[node.input[1]])
+    network.load_state_dict({**network.state_dict(), **weights})
+    for layer, node in zip(layers, convolutions, strict=True):
+        body, place = layer.split(".")
+        batch_norm = network.get_submodule(f"{body}.{int(place) + 1}")
+        unfold(network, seen, [batch_norm])
+        batch_norm.bias += torch.from_numpy(stored[node.input[2]])
 
 
 def exported(network: nn.Module, seen: list[tuple[torch.Tensor, ...]], inputs: list[str]) -> bytes:

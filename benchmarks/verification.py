@@ -1,6 +1,6 @@
 """Train the judges of :mod:`kpbench.verify` on synthetic sets, and show what they give on another set.
 
-    python benchmarks/verification.py DATASET ... --test DATASET [--model FILE.onnx] [--write]
+    python benchmarks/verification.py DATASET ... --test DATASET [--model FILE.onnx] [--go-on] [--write]
 
 The sets must come from photographs that are free for fitting: `kpbench synth --n 1600 --backgrounds training/`.
 Two judges, one before the fit and one after it, of the same small network. Before the fit a hypothesis is right if its
@@ -10,8 +10,9 @@ learns by how much the pose of a hypothesis of the right design is off, if that 
 What the first one is to see at its second look is what the shipped one makes of the first look; hypotheses that the
 shipped one is sure of, and rightly, are shown seldom and with more weight.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
-they are, and by each judge; the second one is what the detector reports. `--write` replaces
-`posed.onnx` and `fitted.onnx` of `kpbench/weights`. Needs `pip install 'kpbench[train]'`.
+they are, and by each judge; the second one is what the detector reports. `--go-on` starts from the weights that ship
+(with `--epochs 0` it shows what they give); `--write` replaces them, `posed.onnx` and `fitted.onnx` of
+`kpbench/weights`. Needs `pip install 'kpbench[train]'`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from small_networks import affine, exported, log_of_map, one_cycle, trunk
+from small_networks import affine, exported, log_of_map, one_cycle, shipped, start_from_shipped, trunk
 from torch import nn
 from tqdm import tqdm
 
@@ -174,9 +175,11 @@ def main() -> None:
     parser.add_argument("--test", required=True)
     parser.add_argument("--model")
     parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--go-on", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(cores())
+    go_on = ("posed", "fitted") if options.go_on else (None, None)
     start(options.model)
     paths = [*options.datasets, options.test]
     with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model,)) as pool:
@@ -188,19 +191,19 @@ def main() -> None:
     seen = [one for part in sets[:-1] for one in part]
     truths = [one.keypoints for one in seen]
     found, known = [look for one in seen for look in (one.posed, one.again)], [kp for kp in truths for _ in range(2)]
-    before = trained(found, known, np.concatenate([one.odds for one in seen]), 0.2, 32, options.epochs)
+    before = trained(found, known, np.concatenate([one.odds for one in seen]), 0.2, 32, options.epochs, go_on[0])
     fits = []
     with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model, before)) as pool:
         for path, part in zip(paths, sets, strict=True):
             found = pool.map(partial(fit, path, path != options.test), range(len(part)), [one.posed for one in part])
             fits.append(list(tqdm(found, f"fit {path}", len(part))))
     found = [one.fitted for part in fits[:-1] for one in part]
-    after = trained(found, truths, np.zeros(sum(map(len, found))), 0.1, 48, options.epochs)
+    after = trained(found, truths, np.zeros(sum(map(len, found))), 0.1, 48, options.epochs, go_on[1])
     report(sets[-1], fits[-1], after)
     if options.write:
         ranges = [one.posed for one in sets[-1]], [one.fitted for one in fits[-1]]
         for name, judge, found in zip(("posed", "fitted"), (before, after), ranges, strict=True):
-            target = Path(verify.__file__).parent / "weights" / f"{name}.onnx"
+            target = shipped(name)
             target.write_bytes(to_onnx(judge, found))
             print(f"{target.name}: {target.stat().st_size} bytes")
 
@@ -216,8 +219,9 @@ def trained(
     tolerance: float,
     width: int,
     epochs: int,
+    name: str | None,
 ) -> Judge:
-    """A judge of these hypotheses: cross-entropy, AdamW, one cycle of the learning rate.
+    """A judge of these hypotheses, from the shipped one of that name if any: cross-entropy, one cycle.
 
     What a judge before it already knew, whose ``odds`` they have, teaches little: of that a share is drawn, other ones
     in every epoch, and weighs as much as the whole.
@@ -237,6 +241,8 @@ def trained(
 
     usual = whole.evidence[:: max(1, len(whole) // 100_000)]
     judge = Judge(usual, width).to(memory_format=torch.channels_last)
+    if name:
+        start_from_shipped(judge, name, _tensors(whole[rng.permutation(len(whole))[:4096]]))
 
     def loss(rows: torch.Tensor) -> torch.Tensor:
         view, evidence = _tensors(whole[rows.numpy()])
@@ -248,7 +254,7 @@ def trained(
         return value
 
     print(f"train on {len(right)} hypotheses, {right.mean():.0%} right, {share.sum():.0f} an epoch")
-    one_cycle(judge, loss, drawn, epochs, 256, 3e-3)
+    one_cycle(judge, loss, drawn, epochs, 256, 2e-3 if name else 3e-3)
     return judge
 
 

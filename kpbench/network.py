@@ -189,8 +189,8 @@ def is_folded(weights: dict[str, Tensor]) -> bool:
     return not any(".bn." in name for name in weights)
 
 
-def unfold(network: SuperPoint, images: Tensor, layers: Iterable[nn.Module] | None = None) -> None:
-    """Let each BatchNorm pass on what it gets, as its statistics stand on these images (B, 1, H, W) in [0, 1].
+def unfold(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
+    """Let each BatchNorm pass on what it gets, as its statistics stand on these inputs of the network.
 
     The contrary of folding: the network computes what its convolutions alone would, and can be trained on.
     ``layers`` are the BatchNorms to be set; None: all.
@@ -208,7 +208,7 @@ def unfold(network: SuperPoint, images: Tensor, layers: Iterable[nn.Module] | No
     hooks = [m.register_forward_pre_hook(pass_on) for m in chosen]
     mode = network.training
     with torch.no_grad():
-        network.eval()(images)
+        network.eval()(*inputs)
     network.train(mode)
     for hook in hooks:
         hook.remove()
@@ -261,7 +261,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
         heard = width
         for name in (f"{head}.0", f"{head}.1", f"{head}_attached"):
             heard = _take(network.get_submodule(name), smaller.get_submodule(name), heard, f"{source}: {name}")
-    unfold(network, images, passing)
+    unfold(network, [images], passing)
     return f"taken into another network, convolutions that pass on: {len(passing)}, left out: {left_out}"
 
 

@@ -420,7 +420,7 @@ def _begin_from(
     batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, count, recipe.phase(0)[1])
     images = _blob(torch.from_numpy(batch.images).to(device))
     if is_folded(weights):
-        unfold(given, images)
+        unfold(given, [images])
     return line if given is network else f"{line}; {grow(network, given, images, str(init))}"
 
 
