@@ -200,6 +200,11 @@ def write_parquet(p: Predictions) -> bytes:
 # --- HDF5 ----------------------------------------------------------------------------------------------------------
 
 
+def _bytes(text: object) -> bytes:
+    """Text of an HDF5 attribute, which may be of a fixed or a variable length."""
+    return text if isinstance(text, bytes) else str(text).encode()
+
+
 def read_h5(path: Path) -> Predictions:
     """Read ``.h5``: a dataset a column, the header in an attribute."""
     import h5py
@@ -209,7 +214,7 @@ def read_h5(path: Path) -> Predictions:
         with h5py.File(path, "r", locking="best-effort") as file:
             header = {}
             if "header" in file.attrs:
-                header = read_header(parse(str(file.attrs["header"]).encode(), "the attribute header"))
+                header = read_header(parse(_bytes(file.attrs["header"]), "the attribute header"))
             for name in sorted(set(file) - H5_COLUMNS.keys()):
                 raise PredictionsError(f"unknown dataset /{name}, expected {', '.join(H5_COLUMNS)}")
             for name, kind in H5_COLUMNS.items():

@@ -131,12 +131,19 @@ def check_regression(comparisons: list[Comparison]) -> None:
     Raises
     ------
     GateFailed
-        Naming every such metric, with the interval of its difference.
+        Naming every such metric, with the interval of its difference; or that there are too few scenes to tell.
     """
     failed = []
     for c in comparisons:
         for d in c.differences:
-            if d.condition is None and d.metric in PAPER_METRICS and d.verdict == "worse" and d.interval:
+            if d.condition is not None or d.metric not in PAPER_METRICS:
+                continue
+            if d.value and d.interval is None:
+                failed.append(
+                    f"{LABELS[d.metric]} of {c.first} differs from that of {c.second} by {d.value:+.4f}, "
+                    "and one scene cannot tell whether by chance"
+                )
+            if d.verdict == "worse" and d.interval:
                 span = f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
                 failed.append(
                     f"{LABELS[d.metric]} of {c.first} is worse than that of {c.second} by {d.value:+.4f} {span}"

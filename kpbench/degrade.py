@@ -421,6 +421,10 @@ def _set(effect: str, parameter: str, **fixed: Any) -> Draw:
     return lambda rng, level, size, discs: {"effect": effect, parameter: level, **fixed}
 
 
+def _draw_jpeg(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
+    return {"effect": "jpeg", "quality": float(round(level))}
+
+
 LADDER: dict[str, Rungs] = {
     "blur": Rungs((3, 7, 11, 15), "px", (1, 501), _set("blur", "kernel_px")),
     "dimming": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k")),
@@ -431,7 +435,7 @@ LADDER: dict[str, Rungs] = {
     "defocus": Rungs((2, 4, 6, 9), "px", (0.1, 250), _set("defocus", "radius_px")),
     "shadow-edge": Rungs((30, 50, 70, 90), "% of the light", (0, 100), _draw_shadow_edge),
     "rain": Rungs((500, 1000, 2000, 4000), "streaks a megapixel", (0, 1e5), _draw_rainfall),
-    "jpeg": Rungs((50, 25, 10, 5), "quality", (1, 100), _set("jpeg", "quality")),
+    "jpeg": Rungs((50, 25, 10, 5), "quality", (1, 100), _draw_jpeg),
     "low-light": Rungs((4, 6, 8, 9), "stops", (0, 14), _set("low_light", "stops")),
     "occlusion": Rungs((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
     "flare": Rungs((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -89,6 +90,8 @@ class LoadedDetector:
             raise DataError(f"detector {self.name}: returned {type(found).__name__}, expected kpbench.Detections")
         if not (np.isfinite(found.xy).all() and np.isfinite(found.score).all()):
             raise DataError(f"detector {self.name}: returned a coordinate or score that is not finite")
+        if found.patch_id is not None and np.any(found.patch_id < 0):
+            raise DataError(f"detector {self.name}: returned the patch id {found.patch_id.min()}, expected 0 or more")
         return found
 
 
@@ -133,6 +136,7 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
 
 def _with(threshold: float | None, detector: Any) -> Any:
     if threshold is not None and hasattr(detector, "threshold"):
+        detector = copy(detector)  # which may be an object that others use as well
         detector.threshold = threshold
     return detector
 

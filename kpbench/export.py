@@ -21,11 +21,11 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from kpbench.design import parse_patch
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.geometry import resize
 from kpbench.network import CELL, SuperPoint
 from kpbench.runtime import open_session
 from kpbench.samples import SampleConfig, load_photos, make_batch
-from kpbench.store import write_atomic
 from kpbench.train import network_of, read_checkpoint
 
 __all__ = ["Exported", "export", "export_int8", "fold", "quantise", "to_onnx"]

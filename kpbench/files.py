@@ -1,24 +1,34 @@
-"""What several modules read: TOML tables, folders of images, and folders that are URLs."""
+"""Files: read as TOML or text, found as images, written whole or not at all; and folders that are URLs."""
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import tempfile
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError
 
-__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_text", "read_toml"]
+__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_text", "read_toml", "write_atomic"]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
 
-def image_files(folder: Path) -> tuple[str, ...]:
-    """Paths of all images below a folder, relative to it and sorted, so that they are the same on every machine."""
-    return tuple(
-        sorted(f.relative_to(folder).as_posix() for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES)
-    )
+def image_files(folder: Path, but: Path | None = None) -> tuple[str, ...]:
+    """Paths of all images below a folder, relative to it and sorted, so that they are the same on every machine.
+
+    What lies in the folder ``but``, where results are written, is left out.
+    """
+    files = [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file()]
+    if but is not None:
+        files = [f for f in files if but.resolve() not in f.resolve().parents]
+    return tuple(sorted(f.relative_to(folder).as_posix() for f in files))
 
 
 def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
@@ -64,6 +74,8 @@ def folder_at(where: str | Path) -> Path:
     url = re.match(r"([a-z][a-z0-9+.-]+):/+(.*)", str(where))  # pathlib makes one slash of two
     if url is None:
         return Path(where)
+    if url[1] == "file":
+        return Path("/", unquote(url[2]))
     try:
         from upath import UPath
 
@@ -78,3 +90,50 @@ def folder_at(where: str | Path) -> Path:
 def is_local(path: object) -> bool:
     """Whether a path is one of this machine's file system, and not a URL's."""
     return isinstance(path, (str, Path))
+
+
+def write_atomic(path: Path, data: bytes | memoryview) -> None:
+    """Write a file whole or not at all: temporary sibling, fsync, rename, fsync of the folder.
+
+    Under a URL it is put in one piece, which object stores do whole or not at all.
+
+    Raises
+    ------
+    DataError
+        If the disk is full or the folder cannot be written; nothing is left behind.
+    """
+    if not is_local(path):
+        with _reaching(path):
+            path.write_bytes(bytes(data))
+        return
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.chmod(name, 0o644)
+            os.replace(name, path)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(name)
+            raise
+        with suppress(OSError):  # not every file system lets a folder be opened
+            folder = os.open(path.parent, os.O_RDONLY)
+            try:
+                os.fsync(folder)
+            finally:
+                os.close(folder)
+    except OSError as error:
+        why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
+        raise DataError(f"{path}: cannot be written, {why}") from None
+
+
+@contextmanager
+def _reaching(path: Path) -> Iterator[None]:
+    """Turn whatever a remote file system raises into one line."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None

@@ -24,7 +24,7 @@ from typing import Any, Protocol
 
 from kpbench import card, store
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local
+from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.workers import Progress, run_pieces
 
 __all__ = ["Recipe", "Run", "generate", "generate_part", "merge"]
@@ -192,7 +192,7 @@ def _bring(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        store.write_atomic(target, source.read_bytes())
+        write_atomic(target, source.read_bytes())
 
 
 def _made(out: str | Path) -> Path:
@@ -241,7 +241,8 @@ def _prepare(
 
 
 def _keep(folder: Path, written: dict[str, Any], plan: list[Piece]) -> dict[str, Result]:
-    """Those shards of a plan that are there, after a look into each."""
+    """Those shards of a plan that are there, after a look into each; if the dataset was finished, byte by byte."""
+    known = store.recorded_digests(folder)
     kept: dict[str, Result] = {}
     for name, first, count in plan:
         path = folder / name
@@ -253,6 +254,8 @@ def _keep(folder: Path, written: dict[str, Any], plan: list[Piece]) -> dict[str,
                     f"{path}: of another dataset than this command makes{why}; use --overwrite or another --out"
                 )
             entry = store.ShardEntry(name, first, count, path.stat().st_size, store.sha256_of(path))
+            if known.get(name, entry.sha256) != entry.sha256:
+                raise DataError(f"{path}: damaged since it was written; delete it, and --resume makes it again")
             kept[name] = (entry, broken)
     return kept
 
@@ -300,20 +303,30 @@ def _complete(
 
 
 @contextmanager
-def _resumable(folder: Path) -> Iterator[None]:
-    """Let errors name the folder as the user does, and say how to go on."""
+def _named(folder: Path) -> Iterator[None]:
+    """Let errors name the folder as the user does."""
     try:
         yield
     except DataError as error:
         said = str(error).replace(str(folder.resolve()), str(folder))
-        said = said if said.startswith(str(folder)) else f"{folder}: {said}"
-        raise DataError(f"{said}; finished shards are kept, add --resume to go on") from None
+        raise DataError(said if said.startswith(str(folder)) else f"{folder}: {said}") from None
+
+
+@contextmanager
+def _resumable(folder: Path) -> Iterator[None]:
+    """Let errors say how to go on, too, where something is there to go on from."""
+    try:
+        with _named(folder):
+            yield
+    except DataError as error:
+        kept = "; finished shards are kept, add --resume to go on" if any(folder.glob("shard-*.h5")) else ""
+        raise DataError(f"{error}{kept}") from None
 
 
 def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[store.Dataset, tuple[str, ...]]:
     """Write the manifest, which makes the folder a dataset, and its card."""
     broken = tuple(sorted({file for _, files in results for file in files}))
-    with _resumable(folder):
+    with _named(folder):
         store.write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
         dataset = store.open_dataset(folder)
         card.write_card(dataset, folder)
@@ -401,7 +414,7 @@ def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: P
 
     with _turn:  # an executor may have several threads a process; caches and albumentations' generators are not theirs
         data = store.encode_shard(made(), count, written, met)
-    store.write_atomic(folder / name, data)
+    write_atomic(folder / name, data)
     return store.ShardEntry(name, first, count, len(data), hashlib.sha256(data).hexdigest()), tuple(sorted(met))
 
 

@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from kpbench.card import names, write_card
 from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.keypoints import KEYPOINT_DTYPE, UInt8
-from kpbench.store import Dataset, write_atomic
+from kpbench.store import Dataset
 
 __all__ = ["FORMATS", "export_dataset"]
 
@@ -141,7 +142,7 @@ def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         write_atomic(folder / "images" / f"{ids[n]:08d}.png", _png(image))
         write_atomic(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
-    listed = "".join(f"  {classes[i]}: {name}\n" for i, name in called.items())
+    listed = "".join(f"  {classes[i]}: {json.dumps(name)}\n" for i, name in called.items())
     # without a path, folders are those beside this file
     text = f"train: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listed}"
     write_atomic(folder / "data.yaml", text.encode())
@@ -156,15 +157,20 @@ def _webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
             for n in range(shard.first, shard.first + shard.count):
                 image, keypoints = dataset[n]
-                columns = {name: keypoints[name].tolist() for name in KEYPOINT_DTYPE.names or ()}
+                columns = {name: _numbers(keypoints[name]) for name in KEYPOINT_DTYPE.names or ()}
                 label = {"image_id": int(ids[n]), "keypoints": columns, "degradations": dataset.effects(n)}
-                for suffix, data in (("png", _png(image)), ("json", json.dumps(label).encode())):
+                for suffix, data in (("png", _png(image)), ("json", json.dumps(label, allow_nan=False).encode())):
                     entry = tarfile.TarInfo(f"{ids[n]:08d}.{suffix}")
                     entry.size = len(data)
                     tar.addfile(entry, io.BytesIO(data))
                 progress(1)
         write_atomic(folder / f"shard-{number:05d}.tar", buffer.getvalue())
     return folder / "shard-00000.tar"
+
+
+def _numbers(column: NDArray[Any]) -> list[Any]:
+    """A column for JSON, which has no nan: null stands for it."""
+    return [None if value != value else value for value in column.tolist()]
 
 
 FORMATS: dict[str, Callable[[Dataset, Path, Progress], Path]] = {

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from kpbench import degrade, store
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.keypoints import Detections, Predictions, UInt8
 from kpbench.preview import draw_detections
 from kpbench.scene import stream
@@ -73,13 +74,12 @@ def predict(
     pieces = [range(first, min(first + 32, len(dataset))) for first in range(0, len(dataset), 32)]
     work = partial(detect_some, dataset, loaded if workers == 1 else detector, threshold)
     found: dict[int, Found] = {}
-    for results in run_pieces(work, pieces, workers, progress):
-        found.update(results)
     ids = dataset.truth.image_id
-    if overlay is not None:
-        with image_writer(overlay) as draw:
-            for n in range(len(dataset)):
-                draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
+    with image_writer(overlay, len(dataset)) as draw:
+        for results in run_pieces(work, pieces, workers, progress):
+            found.update(results)
+        for n in range(len(dataset)) if overlay is not None else ():
+            draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
     labels = [f"image_id {image_id}" for image_id in ids]
     return _predicted(loaded, [found[n] for n in range(len(dataset))], labels, ids, dataset)
 
@@ -99,7 +99,7 @@ def predict_images(
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[Found](), list[str]()
     endless = () if source.length is not None else (KeyboardInterrupt,)
-    with image_writer(overlay, source.fps) as draw, contextlib.suppress(*endless):
+    with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*endless):
         # a camera never ends: Ctrl-C keeps what was found so far
         for label, image in source.images:
             found.append(
@@ -213,7 +213,7 @@ def degrade_files(
         except OSError as error:
             raise DataError(f"{target.parent}: cannot be made, {error.strerror}") from None
         packed = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image)[1]
-        store.write_atomic(target, packed.tobytes())
+        write_atomic(target, packed.tobytes())
         yield target, effects
     if broken:
         raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")

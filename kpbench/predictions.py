@@ -11,11 +11,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kpbench import columns, records
-from kpbench.errors import PredictionsError
+from kpbench.errors import DataError, PredictionsError
+from kpbench.files import write_atomic
 from kpbench.keypoints import Predictions
 from kpbench.pieces import without_gc
 
-__all__ = ["Predictions", "read_predictions", "write_predictions"]
+__all__ = ["Predictions", "check_target", "read_predictions", "write_predictions"]
 
 READERS: dict[str, Callable[[Path], Predictions]] = {
     ".json": records.read_json,
@@ -57,6 +58,25 @@ def read_predictions(path: str | Path) -> Predictions:
         raise PredictionsError(f"{path}: cannot be read, {error.strerror or error}") from None
 
 
+def check_target(path: str | Path) -> Path:
+    """A path that predictions can be written to, by its suffix and folder; what else may fail shows when it is done.
+
+    Raises
+    ------
+    PredictionsError
+        If the suffix is unknown.
+    DataError
+        If the folder is not there.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in WRITERS:
+        *some, last = WRITERS
+        raise PredictionsError(f"{path}: unknown kind of predictions file, expected {', '.join(some)} or {last}")
+    if not path.parent.is_dir():
+        raise DataError(f"{path}: cannot be written, there is no folder {path.parent}")
+    return path
+
+
 def write_predictions(path: str | Path, predictions: Predictions) -> None:
     """Write a predictions file, whole or not at all; its suffix tells the format.
 
@@ -67,12 +87,7 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
     DataError
         If the disk is full or the folder cannot be written.
     """
-    from kpbench.store import write_atomic  # h5py, which reading most formats does not need
-
-    path = Path(path)
-    if path.suffix.lower() not in WRITERS:
-        *some, last = WRITERS
-        raise PredictionsError(f"{path}: unknown kind of predictions file, expected {', '.join(some)} or {last}")
+    path = check_target(path)
     try:
         data = WRITERS[path.suffix.lower()](predictions)
     except PredictionsError as error:

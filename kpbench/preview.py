@@ -46,11 +46,16 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
     return np.asarray(canvas, np.uint8)
 
 
+OUTERMOST_PX = 1e6
+
+
 def draw_detections(image: UInt8, detections: Detections) -> UInt8:
     """An RGB copy of an image with a cross, a ring and the ID on every detection, larger in larger images."""
     canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image.copy(), np.uint8)
     unit = max(1, round(max(canvas.shape) / 800))
-    for n, (x, y) in enumerate(detections.xy):
+    for n, (x, y) in enumerate(detections.xy.tolist()):
+        if abs(x) > OUTERMOST_PX or abs(y) > OUTERMOST_PX:  # OpenCV counts sixteenths of px in 32 bits
+            continue
         patch_id = None if detections.patch_id is None else int(detections.patch_id[n])
         own = (255, 0, 0) if patch_id is None else COLOURS[patch_id % len(COLOURS)]
         for colour, width in (((0, 0, 0), 3 * unit), (own, unit)):  # a dark seam, to be seen on any ground

@@ -337,7 +337,7 @@ def write_report(path: str | Path, report: Report) -> None:
     DataError
         If the suffix is another or the file cannot be written.
     """
-    from kpbench.store import write_atomic
+    from kpbench.files import write_atomic
 
     path = Path(path)
     if path.suffix.lower() not in WRITERS:

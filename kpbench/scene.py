@@ -132,8 +132,10 @@ def random_placements(
         extent = np.array([patch.extent for patch in patches])[chosen]
         centre, reach, _, _ = projected_discs(poses * np.stack([extent, extent, np.ones(tried)], axis=1)[:, None])
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
+            # a wide rim of a steep patch may reach beyond the horizon
+            seen = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
             apart = all(math.hypot(x - x0, y - y0) > r + r0 + 2 for x0, y0, r0 in taken)
-            if len(placements) < count and apart:
+            if len(placements) < count and seen and apart:
                 taken.append((x, y, r))
                 placements.append(Placement(patches[chosen[n]], poses[n], float(black[n]), float(white[n])))
     return placements

@@ -258,8 +258,8 @@ def _groups(rows: Tally) -> Iterator[Group]:
     codes, code = np.unique(condition * len(rungs) + rung, return_inverse=True)
     keys = [Key(str(conditions[c // len(rungs)]) or None, _whole(rungs[c % len(rungs)])) for c in codes]
     parted = keys != [Key()]
-    if parted:
-        yield from images.cut(keys, code)
+    if parted:  # images without a condition, beside others that have one, are no group: it would read as all of them
+        yield from (group for group in images.cut(keys, code) if group.key != Key())
 
     patches, patch = np.unique(rows.truth_id, return_inverse=True)
     if len(patches) > 1:
@@ -267,7 +267,7 @@ def _groups(rows: Tally) -> Iterator[Group]:
         if parted:
             codes, label = np.unique(code[of_image] * len(patches) + of_patch, return_inverse=True)
             both = [keys[c // len(patches)]._replace(patch_id=int(patches[c % len(patches)])) for c in codes]
-            yield from units.cut(both, label)
+            yield from (group for group in units.cut(both, label) if group.key._replace(patch_id=None) != Key())
         yield from units.cut([Key(patch_id=int(p)) for p in patches], of_patch)
 
     bins, size = np.unique(np.searchsorted(RADIUS_EDGES_PX, rows.radius) - 1, return_inverse=True)

@@ -21,6 +21,7 @@ from kpbench.board import Board
 from kpbench.design import Patch
 from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
 from kpbench.errors import DesignError
+from kpbench.files import write_atomic
 from kpbench.outline import Line, Region, circle, move, rectangle
 from kpbench.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
 from kpbench.tiling import Tile, tiles_of
@@ -235,9 +236,9 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
             contents = WRITERS[suffix](sheet.pages, dpi)
             for n, content in enumerate(contents, 1):
                 written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
-                written[-1].write_bytes(content)
+                write_atomic(written[-1], content)
         written.append(folder / f"{stem}.json")
-        written[-1].write_text(json.dumps(sidecar, indent=1) + "\n", "utf-8")
+        write_atomic(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
     except OSError as error:
         raise DesignError(f"{error.filename or folder}: cannot be written ({error.strerror})") from None
     return written

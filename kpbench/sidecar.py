@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.errors import DesignError
+from kpbench.files import write_atomic
 
 __all__ = ["BOARD_SCHEMA", "SHEET_SCHEMA", "correct_sidecars", "corrected", "nm"]
 
@@ -49,7 +50,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
                 continue
             content = json.dumps(corrected(sidecar, measured_mm, str(path)), indent=1) + "\n"
             written.append(path.with_suffix(".measured.json"))
-            written[-1].write_text(content, "utf-8")
+            write_atomic(written[-1], content.encode())
         except (KeyError, TypeError, ValueError) as error:
             raise DesignError(f"{path}: no complete sidecar ({type(error).__name__}: {error})") from None
         except OSError as error:

@@ -14,7 +14,7 @@ from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
 from kpbench.keypoints import UInt8
 
-__all__ = ["Source", "image_writer", "open_images"]
+__all__ = ["Source", "check_apart", "image_writer", "open_images"]
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 PICTURES = (".png", ".jpg", ".jpeg")
@@ -32,8 +32,8 @@ class Source:
     fps: float | None = None
 
 
-def open_images(source: str) -> Source:
-    """Images of ``camera:N``, a video file, an image file, or a folder (by name, subfolders too).
+def open_images(source: str, but: Path | None = None) -> Source:
+    """Images of ``camera:N``, a video file, an image file, or a folder (by name, subfolders too, ``but`` for one).
 
     Raises
     ------
@@ -43,11 +43,11 @@ def open_images(source: str) -> Source:
     path = Path(source)
     if source.startswith("camera:"):
         number = source.removeprefix("camera:")
-        if not number.isdigit():
+        if not number.isdecimal():
             raise DataError(f"{source}: expected camera:0, camera:1, …")
         return _video(cv2.VideoCapture(int(number)), source, None)
     if path.is_dir():
-        files = image_files(path)
+        files = image_files(path, but)
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
         return Source(((name, _decode(path / name)) for name in files), len(files))
@@ -60,6 +60,19 @@ def open_images(source: str) -> Source:
     if image is None:
         raise DataError(f"{path}: cannot be decoded as an image")
     return Source(iter([(path.name, image)]), 1)
+
+
+def check_apart(source: str | Path, target: Path) -> None:
+    """Refuse to write images over those that are read.
+
+    Raises
+    ------
+    DataError
+        If the target is the source, or the folder that it lies in.
+    """
+    given = Path(source).resolve()
+    if target.resolve() in (given, *([given.parent] if given.is_file() else [])):
+        raise DataError(f"{target}: holds the images themselves, which would be overwritten; name another place")
 
 
 def _decode(path: Path) -> UInt8 | None:
@@ -88,8 +101,12 @@ def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> Source:
 
 
 @contextmanager
-def image_writer(target: Path | None, fps: float | None = None) -> Iterator[Callable[[str, UInt8], None]]:
+def image_writer(
+    target: Path | None, count: int | None, fps: float | None = None
+) -> Iterator[Callable[[str, UInt8], None]]:
     """Write RGB images: into a folder as PNG under their names, as a video (.mp4), or the only one as a picture (.png).
+
+    ``count`` is how many there will be, None where nobody knows it.
 
     Raises
     ------
@@ -101,17 +118,15 @@ def image_writer(target: Path | None, fps: float | None = None) -> Iterator[Call
         return
     try:
         file = target.suffix.lower() in (*VIDEOS, *PICTURES) and not target.is_dir()
+        if file and target.suffix.lower() in PICTURES and count != 1:
+            raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
         (target.parent if file else target).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{target}: cannot be written, {error.strerror}") from None
     if not file or target.suffix.lower() in PICTURES:
-        written: list[str] = []
 
         def write_file(name: str, image: UInt8) -> None:
-            if file and written:
-                raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
-            written.append(name)
-            path = target if file else (target / name).with_suffix(".png")
+            path = target if file else target / (name if name.endswith(".png") else f"{name}.png")
             path.parent.mkdir(parents=True, exist_ok=True)
             if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
                 raise DataError(f"{path}: cannot be written")

@@ -5,14 +5,12 @@ The format is described in ``docs/dataset.md``; this is the only module that use
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import json
 import os
-import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local
+from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.keypoints import KEYPOINT_DTYPE, Truth, UInt8
 
-__all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_atomic", "write_manifest"]
+__all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_manifest"]
 
 SCHEMA = "kpbench.dataset/1"
 MANIFEST = "dataset.json"
@@ -69,53 +67,6 @@ class Sample:
 def canonical_json(content: object) -> str:
     """JSON with sorted keys and no spaces: equal contents give equal text."""
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
-
-
-def write_atomic(path: Path, data: bytes | memoryview) -> None:
-    """Write a file whole or not at all: temporary sibling, fsync, rename, fsync of the folder.
-
-    Under a URL it is put in one piece, which object stores do whole or not at all.
-
-    Raises
-    ------
-    DataError
-        If the disk is full or the folder cannot be written; nothing is left behind.
-    """
-    if not is_local(path):
-        with _reaching(path):
-            path.write_bytes(bytes(data))
-        return
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(name, 0o644)
-            os.replace(name, path)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(name)
-            raise
-        with suppress(OSError):  # not every file system lets a folder be opened
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-    except OSError as error:
-        why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
-        raise DataError(f"{path}: cannot be written, {why}") from None
-
-
-@contextmanager
-def _reaching(path: Path) -> Iterator[None]:
-    """Turn whatever a remote file system raises into one line."""
-    try:
-        yield
-    except Exception as error:
-        raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
 
 
 def encode_shard(
@@ -238,6 +189,15 @@ def write_manifest(
     }
     write_atomic(folder / MANIFEST, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
     return mark
+
+
+def recorded_digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every shard by the manifest; nothing if there is no manifest, or none that can be read."""
+    try:
+        shards = json.loads((folder / MANIFEST).read_text("utf-8"))["shards"]
+        return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 def sha256_of(path: Path) -> str:

@@ -84,7 +84,7 @@ def _in_processes(
     work: Callable[[Piece, Progress], Result], pieces: Sequence[Piece], workers: int, progress: Progress
 ) -> Iterator[Result]:
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV or HDF5 may hang
-    counter = spawn.Value("q", 0)
+    counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
     seen = 0
 
@@ -96,9 +96,11 @@ def _in_processes(
 
     try:
         yield from _finished([pool.submit(_in_worker, work, piece) for piece in pieces], tell)
-    finally:
-        for process in multiprocessing.active_children():
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
             process.terminate()
+        raise
+    finally:
         # waits for the pool's own thread, which else, after a worker's death, may be half closed when Python exits
         pool.shutdown(wait=True, cancel_futures=True)
 

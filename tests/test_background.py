@@ -7,6 +7,7 @@ from PIL import Image
 
 from kpbench.background import PhotoFolder, procedural
 from kpbench.errors import DataError
+from kpbench.files import image_files
 
 
 def photo(width=120, height=90, seed=0):
@@ -110,3 +111,9 @@ def test_procedural_backgrounds_differ_and_repeat():
     assert one.shape == (64, 96, 3)
     assert (one == same).all()
     assert (one != other).mean() > 0.5
+
+
+def test_a_folder_or_a_dead_link_named_like_an_image_is_none(folder):
+    (folder / "dir.png").mkdir()
+    (folder / "dead.jpg").symlink_to(folder / "gone.jpg")
+    assert not {"dir.png", "dead.jpg"} & set(image_files(folder))

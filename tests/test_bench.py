@@ -180,3 +180,9 @@ def test_a_program_that_does_not_do_its_work_is_one_line(here, code, says):
     assert len(run.failures) == 28
     assert says in run.failures[0][1]
     assert "\n" not in run.failures[0][1]
+
+
+def test_two_suites_of_one_name_are_refused(here):
+    refused = CliRunner().invoke(main, ["bench", "--suite", "paper-v1", "--suite", "paper-v1", "--quick"])
+    assert refused.exit_code == 2
+    assert "suites of one name, paper-v1, paper-v1" in refused.output

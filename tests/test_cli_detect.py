@@ -1,3 +1,5 @@
+import sys
+import types
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -9,10 +11,12 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.design import load_patches
 from kpbench.detect import LoadedDetector, load_detector
+from kpbench.errors import DataError
 from kpbench.generation import generate
 from kpbench.keypoints import Detections
 from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
+from kpbench.preview import draw_detections
 from kpbench.scene import Limits
 from kpbench.sources import Source
 from kpbench.synth import SynthConfig
@@ -166,6 +170,7 @@ def test_an_image_that_fails_is_named_and_counted_and_the_rest_goes_on(folder, p
         ("text.png", "text.png: cannot be decoded as an image"),
         ("text.mp4", "text.mp4: cannot be opened as a video"),
         ("camera:x", "camera:x: expected camera:0"),
+        ("camera:²", "camera:²: expected camera:0"),
     ],
 )
 def test_bad_sources_are_one_line(folder, plug, source, says):
@@ -226,3 +231,69 @@ def test_template_looks_for_the_designs_it_is_told(folder):
     refused = run("set", "--patches", other, "--detector", "superpoint-small")
     assert refused.exit_code == 2
     assert "--patches is for the template detector" in refused.stderr
+
+
+def test_photographs_are_not_drawn_over_and_drawings_not_read(folder, plug):
+    photos(folder)
+    before = {path: path.read_bytes() for path in (folder / "photos").rglob("*.png")}
+    for source, overlay in ("photos", "photos"), ("photos/0.png", "photos/0.png"), ("photos/0.png", "photos"):
+        refused = run(source, "--detector", f"{plug}:brightest", "--overlay", overlay)
+        assert refused.exit_code == 1
+        assert (
+            refused.stderr
+            == f"kpbench: {overlay}: holds the images themselves, which would be overwritten; name another place\n"
+        )
+    for _ in range(2):
+        assert "in 3 images" in run("photos", "--detector", f"{plug}:brightest", "--overlay", "photos/drawn").stdout
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_two_photographs_of_one_stem_are_drawn_into_two_files(folder, plug):
+    photos(folder, 1)
+    cv2.imwrite(str(folder / "photos" / "0.jpg"), np.zeros((60, 80, 3), np.uint8))
+    assert run("photos", "--detector", f"{plug}:brightest", "--overlay", "drawn").exit_code == 0
+    assert sorted(path.name for path in (folder / "drawn").iterdir()) == ["0.jpg.png", "0.png"]
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "says"),
+    [
+        ("--out", "preds.xml", "preds.xml: unknown kind of predictions file"),
+        ("--out", "no/preds.json", "no/preds.json: cannot be written, there is no folder no"),
+        ("--overlay", "one.png", "one.png: there is more than one image"),
+    ],
+)
+def test_what_cannot_be_written_is_told_before_the_first_image(folder, option, value, says):
+    generate(SynthConfig(3, size_px=(96, 96)), "set", workers=1)
+    name = f"counting_{abs(hash((str(folder), value)))}"
+    code = "def f(image):\n    open('called', 'w')\n    return Detections.none()\n"
+    (folder / f"{name}.py").write_text(f"from kpbench import Detections\n{code}")
+    result = run("set", "--detector", f"{name}:f", "--workers", 1, option, value)
+    assert result.exit_code == 1
+    assert result.stderr.startswith(f"kpbench: {says}")
+    assert not (folder / "called").exists()
+
+
+def test_a_detection_far_outside_is_not_drawn():
+    far = Detections([[1e10, 5.0], [5.0, -1e12]], [1.0, 1.0], [0, 1])
+    assert (draw_detections(np.zeros((20, 30), np.uint8), far) == 0).all()
+
+
+def test_a_threshold_is_for_one_call_alone():
+    class Unsure:
+        threshold = 0.5
+
+        def detect(self, image):
+            return Detections([[1.0, 1.0]], [0.6])[np.array([self.threshold <= 0.6])]
+
+    module = types.ModuleType("unsure_of_a_test")
+    module.one = Unsure()
+    sys.modules[module.__name__] = module
+    image = np.zeros((4, 4), np.uint8)
+    found = [len(load_detector(f"{module.__name__}:one", threshold)(image)) for threshold in (None, 0.8, None)]
+    assert found == [1, 0, 1]
+
+
+def test_a_patch_id_under_zero_is_named():
+    with pytest.raises(DataError, match="detector wrong: returned the patch id -1, expected 0 or more"):
+        LoadedDetector("wrong", "1", lambda image: Detections([[1, 1]], [1.0], [-1]))(np.zeros((4, 4), np.uint8))

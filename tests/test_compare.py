@@ -174,3 +174,13 @@ def _of_other_images(here):
     rows = list(csv.reader((here / "poor.csv").read_text().splitlines()))
     (here / "poor.csv").write_text("\n".join(",".join(row) for row in rows[1:-2]))
     return kpbench("good.json", "poor.csv", code=1).stderr
+
+
+def test_one_scene_cannot_tell_and_does_not_pass():
+    seen, blind = ([Detections([[10, 10]], [1.0], [0])], [Detections.none()])
+    one = Truth(
+        np.arange(1), np.arange(2), TRUTH.keypoints[:1], TRUTH.condition[:1], TRUTH.rung[:1], TRUTH.scene_id[:1]
+    )
+    c = compare(score(one, blind, resamples=100), score(one, seen, resamples=100))
+    with pytest.raises(GateFailed, match=r"detection score of .* by -1\.0000, and one scene cannot tell"):
+        check_regression([c])

@@ -122,3 +122,7 @@ def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch)
     monkeypatch.delenv("NO_ALBUMENTATIONS_UPDATE", raising=False)
     shadow(picture(), 1)
     assert os.environ["NO_ALBUMENTATIONS_UPDATE"] == "1"
+
+
+def test_a_quality_between_two_is_recorded_as_the_one_applied():
+    assert degrade.climb(np.random.default_rng(0), "jpeg", 7.6, (20, 20))["quality"] == 8.0

@@ -1,11 +1,14 @@
 import multiprocessing
 import os
 import runpy
+import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import albumentations
 import cv2
+import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -314,3 +317,43 @@ def test_bad_radii_are_refused_in_a_line(tmp_path, radii, code, said):
     assert result.exit_code == code
     assert said in result.output
     assert not out.exists()
+
+
+def test_processes_of_the_caller_are_left_alone(tmp_path):
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    own.start()
+    try:
+        generate(SynthConfig(2, size_px=(64, 64), shard_size=1), tmp_path / "set", workers=2)
+        assert own.is_alive()
+    finally:
+        own.terminate()
+        own.join()
+
+
+def test_a_damaged_shard_is_not_taken_for_a_whole_one(tmp_path):
+    generate(SynthConfig(4, size_px=(64, 64), shard_size=2), tmp_path / "set", workers=1)
+    before = digests(tmp_path / "set")
+    path = tmp_path / "set" / "shard-00001.h5"
+    with h5py.File(path) as file:
+        inside = file["images"].id.get_chunk_info(0).byte_offset + 9
+    data = bytearray(path.read_bytes())
+    data[inside] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(DataError, match=r"shard-00001\.h5: damaged since it was written; delete it, and --resume"):
+        generate(SynthConfig(4, size_px=(64, 64), shard_size=2), tmp_path / "set", workers=1, resume=True)
+    with pytest.raises(DataError, match="damaged"):
+        merge(tmp_path / "set")
+    path.unlink()
+    generate(SynthConfig(4, size_px=(64, 64), shard_size=2), tmp_path / "set", workers=1, resume=True)
+    assert digests(tmp_path / "set") == before
+
+
+def test_a_file_url_is_a_path(tmp_path):
+    data = generate(SynthConfig(1, size_px=(64, 64)), f"file://{tmp_path}/a%20set", workers=1).dataset
+    assert data.path == tmp_path / "a set"
+
+
+def test_a_rim_beyond_the_horizon_is_drawn_anew(tmp_path):
+    wide = replace(shipped_patches()[0], rim=1.0, quiet_zone=2.0)
+    made = generate(SynthConfig(40, size_px=(160, 120), patches=(wide,)), tmp_path / "set", workers=1).dataset
+    assert np.isfinite(made.truth.keypoints["x"]).all()

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from kpbench import interchange
 from kpbench.errors import DataError
 from kpbench.generation import generate
 from kpbench.interchange import export_dataset
@@ -53,7 +54,7 @@ def test_a_yolo_pose_parser_finds_our_keypoints(dataset, tmp_path):
         assert ((rows[:, 1:7] >= 0) & (rows[:, 1:7] <= 1)).all()
     described = (tmp_path / "yolo" / "data.yaml").read_text()
     assert "kpt_shape: [1, 3]" in described
-    assert "  0: checker" in described
+    assert '  0: "checker"' in described
 
 
 def test_webdataset_tars_hold_our_samples_and_repeat(dataset, tmp_path):
@@ -83,3 +84,16 @@ def test_an_export_never_mixes_with_what_is_there(dataset, tmp_path):
         export_dataset(dataset, "coco", tmp_path)
     with pytest.raises(DataError, match="expected one of: coco, yolo, webdataset"):
         export_dataset(dataset, "voc", tmp_path / "new")
+
+
+def test_names_of_designs_stay_text_in_yaml(dataset, tmp_path, monkeypatch):
+    yaml = pytest.importorskip("yaml")
+    called = {0: "no", 1: "a: b", 2: "wheel", 3: "1"}
+    monkeypatch.setattr(interchange, "names", lambda dataset: called)
+    export_dataset(dataset, "yolo", tmp_path / "yolo")
+    assert yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())["names"] == called
+
+
+def test_a_contrast_that_nobody_could_measure_is_null_in_json():
+    assert interchange._numbers(np.array([1.5, np.nan])) == [1.5, None]
+    assert interchange._numbers(np.array([3])) == [3]

@@ -534,3 +534,13 @@ def test_the_published_schema_says_what_the_reader_says(tmp_path):
         except PredictionsError:
             read = False
         assert validator.is_valid(content) == read, change
+
+
+def test_a_header_of_fixed_length_is_read(tmp_path):
+    path = tmp_path / "p.h5"
+    write_predictions(path, some())
+    with h5py.File(path, "r+") as file:
+        text = str(file.attrs["header"])
+        del file.attrs["header"]
+        file.attrs["header"] = np.bytes_(text.encode())
+    assert read_predictions(path).detector == some().detector

@@ -729,3 +729,10 @@ def test_the_evaluator_needs_neither_generator_nor_files():
     heavy = {"h5py", "torch", "onnxruntime", "cv2", "pandas", "pyarrow"}
     ours = {f"kpbench.{name}" for name in ("design", "scene", "degrade", "store", "pipeline", "detect")}
     assert not (heavy | ours) & set(loaded)
+
+
+def test_images_without_a_condition_beside_others_are_no_group():
+    truth = truth_of([[(10, 10, 10, 0)]] * 4, ["blur", "blur", "", ""], [3, 3, np.nan, np.nan])
+    scores = run(truth, [found((10, 10, 1, 0))] * 2 + [found()] * 2)
+    assert scores.overall.metrics["detection_score"] == 0.5
+    assert [(g.condition, g.rung, g.patch_id) for g in scores.by] == [("blur", 3, None)]

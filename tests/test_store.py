@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from kpbench import store
 from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.keypoints import KEYPOINT_DTYPE
 from kpbench.store import (
     Sample,
@@ -17,7 +18,6 @@ from kpbench.store import (
     open_dataset,
     open_shard,
     sha256_of,
-    write_atomic,
     write_manifest,
 )
 

@@ -83,3 +83,9 @@ def test_a_suite_with_tags_shows_the_same_scenes():
     assert len(sample.keypoints) == 8
     assert "patches" not in tags.to_dict()
     assert tags.to_dict()["board"]["name"] == "aruco"
+
+
+@pytest.mark.parametrize("name", TAG_BOARDS)
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (1, 50), (9, 9)])
+def test_an_image_of_a_few_px_holds_none(name, size):
+    assert len(load_detector(name)(np.zeros(size, np.uint8))) == 0

@@ -43,6 +43,7 @@ def analyze_patches(
     from kpbench.design import load_patches, shipped_patches
     from kpbench.design_figure import design_figure
     from kpbench.draw import WRITERS
+    from kpbench.files import write_atomic
 
     if searching and files:
         raise click.UsageError("--search goes through a whole family of designs and takes no FILES")
@@ -66,9 +67,9 @@ def analyze_patches(
     click.echo(_table(measured))
     if json_file is not None:
         content = measured.to_dict() | ({"search": found.to_dict()} if found else {})
-        _write(json_file, (json.dumps(content, indent=1) + "\n").encode())
+        write_atomic(json_file, (json.dumps(content, indent=1) + "\n").encode())
     if figure is not None:
-        _write(figure, WRITERS[figure.suffix.lower()]([design_figure(measured, patches)], 200.0)[0])
+        write_atomic(figure, WRITERS[figure.suffix.lower()]([design_figure(measured, patches)], 200.0)[0])
 
 
 def _windows(backgrounds: Path | None) -> UInt8:
@@ -155,12 +156,3 @@ def _columns(names: list[str], head: list[str], rows: list[list[str]]) -> list[s
         )
         for row in table
     ]
-
-
-def _write(path: Path, content: bytes) -> None:
-    from kpbench.errors import DesignError
-
-    try:
-        path.write_bytes(content)
-    except OSError as error:
-        raise DesignError(f"{path}: cannot be written ({error.strerror})") from None

@@ -73,7 +73,10 @@ def bench(
         raise click.UsageError("--quick sets --images and --size; drop one of them")
     if quick:
         images, size = 20, (640, 480)
-    configs = [SuiteConfig(load_suite(name), images, seed, size, only, backgrounds) for name in suites]
+    loaded = [load_suite(name) for name in suites]
+    if len({suite.name for suite in loaded}) < len(loaded):
+        raise click.UsageError(f"suites of one name, {', '.join(s.name for s in loaded)}: their results would be mixed")
+    configs = [SuiteConfig(suite, images, seed, size, only, backgrounds) for suite in loaded]
     try:
         with progress_bar(images_to_do(configs, detectors), "bench") as progress:
             benched = run_bench(configs, detectors, out, workers=workers, progress=progress)
@@ -92,9 +95,9 @@ def bench(
 def _report(out: Path, suite: str, runs: list[Benched]) -> None:
     """Print the tables of one suite, and write its report and scores."""
     from kpbench.exhibits import breakpoint_table, overview_table, paper_table
+    from kpbench.files import write_atomic
     from kpbench.paper import PAPER
     from kpbench.report import Report, provenance, scores_file, write_report
-    from kpbench.store import write_atomic
     from kpbench.tables import to_markdown
 
     scores = tuple(run.scores for run in runs)

@@ -183,7 +183,8 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     import cv2
 
     from kpbench.card import overview
-    from kpbench.store import open_dataset, write_atomic
+    from kpbench.files import write_atomic
+    from kpbench.store import open_dataset
 
     data = open_dataset(dataset)
     sheet = overview(data, count, columns, tile_width)

@@ -60,10 +60,13 @@ def detect(
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.pipeline import predict, predict_images
-    from kpbench.predictions import write_predictions
-    from kpbench.sources import open_images
+    from kpbench.predictions import check_target, write_predictions
+    from kpbench.sources import check_apart, open_images
     from kpbench.store import open_dataset
 
+    check_target(out)
+    if overlay is not None:
+        check_apart(source, overlay)
     detector = _told(name, patches, threshold) if patches else name
     if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
         dataset = open_dataset(source)
@@ -76,7 +79,7 @@ def detect(
         with progress_bar(len(dataset), "detect") as progress:
             run = predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
     else:
-        images = open_images(source)
+        images = open_images(source, but=overlay)
         with progress_bar(images.length, "detect") as progress:
             run = predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
     write_predictions(out, run.predictions)

@@ -109,9 +109,9 @@ def score(
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
     from kpbench.exhibits import pose_table
+    from kpbench.files import write_atomic
     from kpbench.report import provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
-    from kpbench.store import write_atomic
     from kpbench.tables import to_plain
 
     _check_report(report_file)
@@ -160,8 +160,8 @@ def compare(
     from kpbench.comparison import check_regression
     from kpbench.comparison import compare as compare_scores
     from kpbench.exhibits import difference_table, verdict_table
+    from kpbench.files import write_atomic
     from kpbench.report import comparison_file, provenance
-    from kpbench.store import write_atomic
     from kpbench.tables import to_plain
 
     if len(files) < 2:

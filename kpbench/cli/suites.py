@@ -97,16 +97,15 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     from kpbench.cli.progress import progress_bar
     from kpbench.errors import DataError
     from kpbench.pipeline import degrade_files
-    from kpbench.sources import open_images
+    from kpbench.sources import check_apart, open_images
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
     steps = tuple(zip(effects, levels, strict=True))
     if (source / "dataset.json").exists():
         raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
-    if (source if source.is_dir() else source.parent).resolve() == out.resolve():
-        raise DataError(f"{out}: holds the images themselves, which would be overwritten; name another --out")
-    images = open_images(str(source))
+    check_apart(source, out)
+    images = open_images(str(source), but=out)
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):
             click.echo(f"{path} {json.dumps(applied)}")

@@ -42,6 +42,10 @@ class ArucoDetector:
         return Detections(xy, np.ones(len(xy)), np.asarray(4 * ids.reshape(-1, 1) + np.arange(4), np.int64))
 
 
+SMALLEST_PX = 8
+"""Side of the smallest image that :class:`AprilTagDetector` looks at."""
+
+
 class AprilTagDetector:
     """The AprilTag library's own detector (``pip install apriltag-python``).
 
@@ -68,7 +72,9 @@ class AprilTagDetector:
 
     def detect(self, image: UInt8) -> Detections:
         """Corners of all tags in one image, uint8 (H, W) or RGB (H, W, 3); the score is the decision margin."""
-        found = self._detector.detect(np.ascontiguousarray(to_grey(image)))
+        grey = np.ascontiguousarray(to_grey(image))
+        # of a few px the library makes none, which ends the process; no tag is as small
+        found = self._detector.detect(grey) if min(grey.shape) >= SMALLEST_PX else ()
         if not found:
             return Detections.none()
         # The library counts from the corner of the top-left pixel, and its tags stand on their heads in OpenCV's
