@@ -297,3 +297,12 @@ def test_a_threshold_is_for_one_call_alone():
 def test_a_patch_id_under_zero_is_named():
     with pytest.raises(DataError, match="detector wrong: returned the patch id -1, expected 0 or more"):
         LoadedDetector("wrong", "1", lambda image: Detections([[1, 1]], [1.0], [-1]))(np.zeros((4, 4), np.uint8))
+
+
+def test_an_interrupt_says_how_to_go_on(folder):
+    photos(folder)
+    name = f"stopped_{abs(hash(str(folder)))}"
+    (folder / f"{name}.py").write_text("def f(image):\n    raise KeyboardInterrupt\n")
+    result = run("photos", "--detector", f"{name}:f")
+    assert result.exit_code == 130
+    assert result.stderr == "kpbench: interrupted: preds.json is not written; the same command starts anew\n"

@@ -11,6 +11,7 @@ from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 if TYPE_CHECKING:
     from kpbench.detect import LoadedDetector
+    from kpbench.pipeline import Predicted
 
 __all__ = ["detect"]
 
@@ -58,30 +59,17 @@ def detect(
       kpbench detect photos --detector template --patches my-patch.toml
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
-    from kpbench.cli.progress import progress_bar
-    from kpbench.pipeline import predict, predict_images
     from kpbench.predictions import check_target, write_predictions
-    from kpbench.sources import check_apart, open_images
-    from kpbench.store import open_dataset
+    from kpbench.sources import check_apart
 
     check_target(out)
     if overlay is not None:
         check_apart(source, overlay)
     detector = _told(name, patches, threshold) if patches else name
-    if (Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5")):
-        dataset = open_dataset(source)
-        if not patches and name in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
-            click.echo(
-                f"kpbench: {source} holds other designs than {name} looks for; use template with --patches, "
-                "or weights trained on them",
-                err=True,
-            )
-        with progress_bar(len(dataset), "detect") as progress:
-            run = predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
-    else:
-        images = open_images(source, but=overlay)
-        with progress_bar(images.length, "detect") as progress:
-            run = predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
+    try:
+        run = _run(source, name, detector, threshold, overlay, bool(patches), workers)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"{out} is not written; the same command starts anew") from None
     write_predictions(out, run.predictions)
     click.echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
     if run.failures:
@@ -89,6 +77,36 @@ def detect(
             click.echo(f"kpbench: {label}: {problem}", err=True)
         click.echo(f"kpbench: {len(run.failures)} images failed, they count as no detections", err=True)
         raise SystemExit(1)
+
+
+def _run(
+    source: str,
+    name: str,
+    detector: str | LoadedDetector,
+    threshold: float | None,
+    overlay: Path | None,
+    told: bool,
+    workers: int | None,
+) -> Predicted:
+    """The detector ``name``, over a dataset or over images; ``told`` if it was told the designs."""
+    from kpbench.cli.progress import progress_bar
+    from kpbench.pipeline import predict, predict_images
+    from kpbench.sources import open_images
+    from kpbench.store import open_dataset
+
+    if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):
+        images = open_images(source, but=overlay)
+        with progress_bar(images.length, "detect") as progress:
+            return predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
+    dataset = open_dataset(source)
+    if not told and name in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
+        click.echo(
+            f"kpbench: {source} holds other designs than {name} looks for; use template with --patches, "
+            "or weights trained on them",
+            err=True,
+        )
+    with progress_bar(len(dataset), "detect") as progress:
+        return predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
 
 
 def _others(config: dict[str, Any]) -> bool:
