@@ -17,6 +17,8 @@ from scipy.sparse import csr_array
 from kpbench.design import Patch
 from kpbench.keypoints import Float
 from kpbench.match import (
+    ANGLES,
+    TURNS,
     Bank,
     Float32,
     Ints,
@@ -31,7 +33,7 @@ from kpbench.match import (
     soft_ink,
 )
 
-__all__ = ["RING_PX", "extend", "likeness", "search"]
+__all__ = ["RING_PX", "alike", "extend", "likeness", "search"]
 
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
@@ -108,6 +110,25 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
         far = rows[~ended]
         A[far], _ = _reach(levels, poses[far], known, len(RADII))
     return Poses(poses.xy, A, poses.which, poses.ncc)
+
+
+def alike(poses: Poses, known: Bank) -> tuple[Ints, Poses]:
+    """Poses in every rotation in which the innermost sectors look the same and the whole design does not.
+
+    Returns
+    -------
+    Rows (M,) of the given poses, in order and each once or more, and their poses.
+    """
+    core, whole = (np.bincount(t.turned_which, minlength=len(known.patches)) for t in (known.core, known.whole))
+    # of a design that looks the same n times in a turn one in n rotations is listed
+    period = 2 * np.pi * core / ANGLES
+    many = np.maximum(np.rint(ANGLES / core / (TURNS / whole)), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(poses)), many[poses.which])
+    first = np.searchsorted(row, row)
+    angle = (np.arange(len(row)) - first) * period[poses.which[row]]
+    c, s = np.cos(angle), np.sin(angle)
+    turned = poses[row]
+    return row, Poses(turned.xy, turned.A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0), turned.which, turned.ncc)
 
 
 NEAR = 12

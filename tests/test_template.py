@@ -5,7 +5,7 @@ import pytest
 
 from kpbench import degrade, match
 from kpbench.background import procedural
-from kpbench.design import parse_patch, shipped_patches
+from kpbench.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.detect import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
@@ -149,3 +149,15 @@ def test_more_poses_than_remap_takes_at_once_are_sampled():
     xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
     values = match.sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
     assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()
+
+
+def test_a_design_whose_centre_looks_the_same_after_half_a_turn_is_found_in_every_rotation():
+    outer, inner = SemiCircle(1.0, 0.0, "black"), SemiCircle(0.5, 90.0, "invert")
+    patch = Patch("half-turn", 7, "white", (outer, inner))
+    find = TemplateDetector((patch,))
+    for angle in range(10, 370, 30):
+        H = np.eye(3)
+        H[:2, :2], H[:2, 2] = 25 * turn(angle), (60.2, 58.7)
+        background = procedural(np.random.default_rng(1), 120, 120)
+        found = find(render_scene(background, [Placement(patch, H, 40.0, 215.0)]).image)
+        assert np.hypot(*(found.xy - (60.2, 58.7)).T).min(initial=9) < 0.05, angle

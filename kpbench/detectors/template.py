@@ -175,7 +175,10 @@ class TemplateDetector:
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
-        whole = match.align(smooth, sectors.extend(smooth, core, known), known.whole, 4, match.WHOLE_PX)
+        row, turned = sectors.alike(sectors.extend(smooth, core, known), known)
+        whole = match.align(smooth, turned, known.whole, 4, match.WHOLE_PX)
+        best = np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]  # of the rotations of each
+        whole = whole[best]
         sure = sectors.likeness(core.ncc, whole.ncc) > LIKENESS
         core, whole = core[sure], whole[sure]
         fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
