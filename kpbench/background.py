@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -79,7 +80,7 @@ class PhotoFolder:
     def digest(self) -> str:
         """SHA-256 over names and sizes of all files: tells whether the folder has changed."""
         listing = "\n".join(f"{name}\t{(self.path / name).stat().st_size}" for name in self.files)
-        return hashlib.sha256(listing.encode()).hexdigest()
+        return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
     def decode(self, name: str, channels: int) -> UInt8 | None:
         """One whole photograph, (H, W) or (H, W, 3) in RGB; None if it is broken."""

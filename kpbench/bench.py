@@ -24,6 +24,7 @@ from kpbench import __version__, store
 from kpbench.design import shipped_patches
 from kpbench.detect import DETECTORS, PROGRAM, LoadedDetector, load_detector
 from kpbench.errors import DataError
+from kpbench.files import check_own
 from kpbench.generation import generate
 from kpbench.pipeline import detect_some
 from kpbench.predictions import Predictions, read_predictions, write_predictions
@@ -103,8 +104,9 @@ def bench(
     Raises
     ------
     DataError
-        If a detector cannot be loaded, two have one name, or a dataset cannot be made.
+        If a detector cannot be loaded, two have one name, a dataset cannot be made, or the folder holds other files.
     """
+    check_own(Path(out), "suites", "a bench")
     loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
     labels = [detector.name for detector in loaded.values()]
     if len(set(labels)) < len(labels):

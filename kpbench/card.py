@@ -142,7 +142,7 @@ image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
 
 Made with {versions}.
 """
-    write_atomic(folder / FILES[0], text.encode())
+    write_atomic(folder / FILES[0], text.encode(errors="backslashreplace"))
 
 
 def _table(histogram: Histogram) -> str:

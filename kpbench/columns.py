@@ -95,7 +95,7 @@ def read_csv(path: Path) -> Predictions:
             warnings.simplefilter("ignore")  # pandas 3.1 deprecates float_precision, pandas 2 is inexact without
             warnings.simplefilter("error", pd.errors.ParserWarning)  # a row that is too long is only a warning
             table = pd.read_csv(
-                path,
+                _without_blank_end(path),
                 skiprows=skipped,
                 index_col=False,
                 dtype={name: np.int64 if name == "image_id" else np.float64 for name in names},
@@ -108,6 +108,15 @@ def read_csv(path: Path) -> Predictions:
     except (ValueError, Warning) as error:  # pandas' parser errors are ValueErrors
         raise _first_bad_row(path, skipped, names, place, error) from None
     return from_table({name: table[name].to_numpy() for name in names}, header, place)
+
+
+def _without_blank_end(path: Path) -> Path | io.BytesIO:
+    """A file, or what it holds where blank lines follow, which editors leave."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - 64))
+        end = file.read()
+    blank = end[len(end.rstrip()) :].count(b"\n") > 1
+    return io.BytesIO(path.read_bytes().rstrip() + b"\n") if blank else path
 
 
 def _columns(names: list[str], place: str) -> list[str]:

@@ -7,7 +7,7 @@ import os
 import re
 import tempfile
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,17 @@ from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError
 
-__all__ = ["IMAGE_SUFFIXES", "folder_at", "image_files", "is_local", "read_text", "read_toml", "write_atomic"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "check_own",
+    "check_targets",
+    "folder_at",
+    "image_files",
+    "is_local",
+    "read_text",
+    "read_toml",
+    "write_atomic",
+]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
@@ -90,6 +100,38 @@ def folder_at(where: str | Path) -> Path:
 def is_local(path: object) -> bool:
     """Whether a path is one of this machine's file system, and not a URL's."""
     return isinstance(path, (str, Path))
+
+
+def check_targets(targets: Iterable[Path | None], sources: Iterable[Path] = ()) -> None:
+    """Refuse to write a file that the same command reads, or writes twice.
+
+    Raises
+    ------
+    DataError
+        Naming it.
+    """
+    taken = {path.resolve() for path in sources}
+    for target in targets:
+        if target is None:
+            continue
+        if target.resolve() in taken:
+            raise DataError(f"{target}: this command reads it, or writes it twice; name another file to write")
+        taken.add(target.resolve())
+
+
+def check_own(folder: Path, mark: str, what: str) -> None:
+    """Refuse to write among other files: a folder must be new, empty, or hold ``mark`` from an earlier run.
+
+    Raises
+    ------
+    DataError
+        Naming one of the other files; or the folder, if it is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{folder}: a file, expected a folder")
+    others = sorted(path.name for path in folder.glob("*") if not path.name.startswith("."))
+    if others and not (folder / mark).exists():
+        raise DataError(f"{folder}: holds other files ({others[0]}, ...), expected a new or an empty folder for {what}")
 
 
 def write_atomic(path: Path, data: bytes | memoryview) -> None:

@@ -134,7 +134,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             return dict(load_file(path))
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, SafetensorError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        why = (str(error) or type(error).__name__).splitlines()[0]
+        why = (isinstance(error, OSError) and error.strerror) or "neither safetensors nor PyTorch's own"
         raise DataError(f"{path}: cannot be read as weights ({why})") from None
     if not isinstance(loaded, dict) or not all(
         isinstance(name, str) and isinstance(value, Tensor) for name, value in loaded.items()

@@ -51,6 +51,8 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
         if done.returncode:
             said = done.stderr.strip().splitlines() or ["nothing on stderr"]
             raise DataError(f"{command}: exit code {done.returncode}, {said[-1]}")
+        if not out.exists():
+            raise DataError(f"{command}: wrote no predictions file where its last argument says")
         found = read_predictions(out)
     by_image = dict(zip(found.image_id.tolist(), found.detections(), strict=True))
     missing = [n for n in range(len(images)) if n not in by_image]

@@ -406,7 +406,8 @@ def evaluate(
 def summarise(rows: Tally) -> Scores:
     """All metrics of a tally."""
     overall, *by = _groups(rows)
-    name = " ".join(str(rows.detector[key]) for key in ("name", "version") if rows.detector.get(key))
+    told = (str(rows.detector.get(key) or "") for key in ("name", "version"))
+    name = " ".join(part for part in told if part not in ("", "unknown"))
     return Scores(overall, tuple(by), _confusion(rows), _curve(rows), rows, name or "detector")
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
-from kpbench.files import IMAGE_SUFFIXES, image_files
+from kpbench.files import IMAGE_SUFFIXES, image_files, write_atomic
 from kpbench.keypoints import UInt8
 
 __all__ = ["Source", "check_apart", "image_writer", "open_images"]
@@ -128,23 +128,42 @@ def image_writer(
         def write_file(name: str, image: UInt8) -> None:
             path = target if file else target / (name if name.endswith(".png") else f"{name}.png")
             path.parent.mkdir(parents=True, exist_ok=True)
-            if not cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR)):
-                raise DataError(f"{path}: cannot be written")
+            # OpenCV itself writes halves of files, and ends the process on names that are no UTF-8
+            suffix = path.suffix.lower()
+            write_atomic(path, cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
 
         yield write_file
         return
+    with _video_writer(target, fps or 25.0) as write:
+        yield write
+
+
+@contextmanager
+def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], None]]:
+    """Frames as a video, whole or not at all: OpenCV says nothing of a disk that is full."""
+    part = target.with_name(f".{target.stem}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
+    written = 0
 
     def write_frame(name: str, image: UInt8) -> None:
+        nonlocal written
         if not video:
             size = (image.shape[1], image.shape[0])
-            video.append(cv2.VideoWriter(str(target), cv2.VideoWriter.fourcc(*"mp4v"), fps or 25.0, size))
+            video.append(cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size))
             if not video[0].isOpened():
                 raise DataError(f"{target}: cannot be written as a video, expected a name ending in .mp4")
         video[0].write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        written += 1
 
     try:
         yield write_frame
+        for writer in video:
+            writer.release()
+        if video and int(cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT)) != written:
+            raise DataError(f"{target}: cannot be written whole, is the disk full?")
+        if video:
+            part.replace(target)
     finally:
         for writer in video:
             writer.release()
+        part.unlink(missing_ok=True)

@@ -101,7 +101,7 @@ def encode_shard(
             "broken_backgrounds": canonical_json(sorted(broken)),
         }
         for name, text in attributes.items():
-            file.attrs.create(name, text.encode(), dtype=_text_type([text.encode()]))
+            file.attrs.create(name, _utf8(text), dtype=_text_type([_utf8(text)]))
         file.attrs["version"] = 1
 
         def column(name: str, values: NDArray[Any], **compression: Any) -> None:
@@ -147,7 +147,7 @@ def _text_type(packed: Sequence[bytes]) -> Any:
 
 
 def _fixed_text(values: Sequence[str]) -> NDArray[Any]:
-    packed = [value.encode() for value in values]
+    packed = [_utf8(value) for value in values]
     return np.array(packed, _text_type(packed))
 
 
@@ -169,7 +169,7 @@ class ShardEntry:
 def fingerprint(config: Mapping[str, Any], shards: Sequence[ShardEntry]) -> str:
     """SHA-256 over the config and the digests of all shards."""
     lines = [canonical_json(config), *(shard.sha256 for shard in shards)]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+    return hashlib.sha256(_utf8("\n".join(lines))).hexdigest()
 
 
 def write_manifest(
@@ -187,8 +187,13 @@ def write_manifest(
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }
-    write_atomic(folder / MANIFEST, (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode())
+    write_atomic(folder / MANIFEST, _utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
     return mark
+
+
+def _utf8(text: str) -> bytes:
+    """UTF-8, and what a file's name holds beyond that escaped, as JSON has it."""
+    return text.encode(errors="backslashreplace")
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:

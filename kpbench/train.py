@@ -345,7 +345,12 @@ def train(
         raise DataError(f"batch is {recipe.batch}, expected a multiple of the {world} processes")
     if checkpoint.exists() and not resume_run:
         raise DataError(f"{checkpoint}: there is a training in this folder; use --resume, or another folder")
-    folder.mkdir(parents=True, exist_ok=True)
+    if resume_run and not checkpoint.exists():
+        raise DataError(f"{checkpoint}: nothing to go on from yet; leave --resume out")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
     state = start(recipe, device)
     if resume_run:
         resume(state, checkpoint, designs)

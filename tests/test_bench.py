@@ -96,7 +96,7 @@ def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
     scores = json.loads((here / "out/scores/paper-v1/mine-frail.json").read_text())
     failures = scores["detector"]["failures"]
     assert 0 < len(failures) < 32
-    assert f"mine:frail unknown on paper-v1: image_id {failures[0][0]}: ValueError: I do not like this one" in (
+    assert f"mine:frail on paper-v1: image_id {failures[0][0]}: ValueError: I do not like this one" in (
         done.stderr
     )
     assert f"kpbench: detectors failed on {len(failures)} images, which count as no detections\n" in done.stderr
@@ -117,8 +117,8 @@ def test_the_command_tells_the_difference_to_the_paper(here):
     assert done.exit_code == 0, done.output
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "|" in line]
     paper = next(row for row in rows if row[:2] == ["detection", "paper"])
-    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners unknown"])
-    less = next(row for row in rows if row[:2] == ["detection", "mine:corners unknown less the paper"])
+    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners"])
+    less = next(row for row in rows if row[:2] == ["detection", "mine:corners less the paper"])
     assert paper[2:] == ["photographs", "1.000", "0.986", "0.882", "0.605"]
     for theirs, value, between in zip(paper[3:], ours[3:], less[3:], strict=True):
         assert abs(float(value.split()[0]) - float(theirs) - float(between.split()[0])) < 0.0011
@@ -186,3 +186,14 @@ def test_two_suites_of_one_name_are_refused(here):
     refused = CliRunner().invoke(main, ["bench", "--suite", "paper-v1", "--suite", "paper-v1", "--quick"])
     assert refused.exit_code == 2
     assert "suites of one name, paper-v1, paper-v1" in refused.output
+
+
+def test_a_folder_of_other_files_is_left_alone(here):
+    (here / "photos").mkdir()
+    (here / "photos" / "scores.json").write_text("mine")
+    with pytest.raises(DataError, match=r"photos: holds other files \(scores.json"):
+        bench([SMALL], ["aruco"], "photos")
+    refused = CliRunner().invoke(main, ["demo", "--n", "1", "--out", "photos"])
+    assert refused.exit_code == 1
+    assert "photos: holds other files (scores.json, ...), expected a new or an empty folder" in refused.output
+    assert [path.name for path in (here / "photos").iterdir()] == ["scores.json"]

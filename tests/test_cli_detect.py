@@ -1,3 +1,4 @@
+import os
 import sys
 import types
 from contextlib import nullcontext
@@ -18,7 +19,7 @@ from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
 from kpbench.preview import draw_detections
 from kpbench.scene import Limits
-from kpbench.sources import Source
+from kpbench.sources import Source, image_writer
 from kpbench.synth import SynthConfig
 
 MODULE = """
@@ -306,3 +307,49 @@ def test_an_interrupt_says_how_to_go_on(folder):
     result = run("photos", "--detector", f"{name}:f")
     assert result.exit_code == 130
     assert result.stderr == "kpbench: interrupted: preds.json is not written; the same command starts anew\n"
+
+
+def draw_video(count, stop=None):
+    with image_writer(Path("out.mp4"), count) as draw:
+        for _ in range(count):
+            draw("0.png", np.zeros((64, 96, 3), np.uint8))
+        if stop:
+            raise stop
+
+
+def test_a_video_that_is_not_finished_is_not_there(folder):
+    with pytest.raises(KeyboardInterrupt):
+        draw_video(3, KeyboardInterrupt)
+    assert not [path for path in folder.iterdir() if "out" in path.name]
+    draw_video(3)
+    assert cv2.VideoCapture("out.mp4").get(cv2.CAP_PROP_FRAME_COUNT) == 3
+
+
+def test_a_video_that_lacks_frames_is_told(folder, monkeypatch):
+    class Full:
+        fourcc = staticmethod(cv2.VideoWriter.fourcc)
+
+        def __init__(self, name, *_):
+            Path(name).write_bytes(b"cut")
+
+        def __getattr__(self, name):
+            return lambda *_: True
+
+    monkeypatch.setattr(cv2, "VideoWriter", Full)
+    with pytest.raises(DataError, match=r"out\.mp4: cannot be written whole, is the disk full"):
+        draw_video(1)
+    assert not [path for path in folder.iterdir() if "out" in path.name]
+
+
+def test_a_name_that_is_no_utf8_is_drawn_and_made_into_a_set(folder, plug):
+    photos(folder, 1)
+    os.rename(folder / "photos" / "0.png", os.fsencode(folder / "photos") + b"/\xff.png")
+    assert run("photos", "--detector", f"{plug}:brightest", "--overlay", "drawn").exit_code == 0
+    assert os.listdir(os.fsencode(folder / "drawn")) == [b"\xff.png"]
+    made = generate(SynthConfig(2, size_px=(96, 96), backgrounds=folder / "photos"), "set", workers=1)
+    assert len(list(made.dataset.verify())) == 1
+
+
+@pytest.mark.parametrize("name", ["orb", "sift"])
+def test_an_image_of_a_few_px_holds_no_features(name):
+    assert [len(load_detector(name)(np.zeros(size, np.uint8))) for size in ((1, 1), (2, 3), (1, 50))] == [0, 0, 0]

@@ -315,3 +315,19 @@ def test_no_coco_truth_is_one_line(here, text, problem):
     write_predictions("p.json", perfect([[]]))
     assert complaint("p.json", "--gt", "gt.json").startswith(f"kpbench: gt.json: {problem}")
     assert complaint("p.json", "--gt", "none.json").startswith("kpbench: none.json: cannot be read")
+
+
+def test_what_is_read_is_not_written(here):
+    write_dataset(here / "kpbench-data", IMAGES)
+    write_predictions("preds.json", perfect())
+    before = Path("preds.json").read_bytes()
+    for arguments in (
+        ["score", "preds.json", "--json", "preds.json"],
+        ["score", "preds.json", "--json", "a.html", "--report", "a.html"],
+        ["compare", "preds.json", "preds.json", "--json", "preds.json"],
+    ):
+        refused = CliRunner().invoke(main, arguments)
+        assert refused.exit_code == 1
+        assert "this command reads it, or writes it twice" in refused.stderr
+    assert Path("preds.json").read_bytes() == before
+    assert not Path("a.html").exists()

@@ -544,3 +544,12 @@ def test_a_header_of_fixed_length_is_read(tmp_path):
         del file.attrs["header"]
         file.attrs["header"] = np.bytes_(text.encode())
     assert read_predictions(path).detector == some().detector
+
+
+def test_blank_lines_at_the_end_of_a_csv_are_left_out(tmp_path):
+    path = tmp_path / "p.csv"
+    path.write_text("image_id,x,y\n0,1,2\n1,,\n\n \n")
+    assert read_predictions(path).xy.tolist() == [[1.0, 2.0]]
+    path.write_text("image_id,x,y\n0,1,2\n\n1,,\n")
+    with pytest.raises(PredictionsError, match="line 3 has 0 values, expected 3"):
+        read_predictions(path)

@@ -59,7 +59,8 @@ class LazyGroup(click.Group):
             click.echo(f"kpbench: {error}", err=True)
             sys.exit(1)
         except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
-            click.echo(f"kpbench: {error.strerror or error}", err=True)
+            if not isinstance(error, BrokenPipeError):  # who closes a pipe early knows it
+                click.echo(f"kpbench: {error.strerror or error}", err=True)
             with contextlib.suppress(OSError, ValueError):  # or Python tries once more at its end, and exits with 120
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)

@@ -23,7 +23,9 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
       kpbench demo
     """
     from kpbench.cli import main
+    from kpbench.files import check_own
 
+    check_own(out, "print", "the demo")
     data, preds = out / "data", out / "preds.json"
     photographs = ["--backgrounds", str(backgrounds)] if backgrounds else []
     steps = [

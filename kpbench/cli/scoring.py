@@ -109,12 +109,13 @@ def score(
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
     from kpbench.exhibits import pose_table
-    from kpbench.files import write_atomic
+    from kpbench.files import check_targets, write_atomic
     from kpbench.report import provenance, scores_csv, scores_file
     from kpbench.scoring import check_gates
     from kpbench.tables import to_plain
 
     _check_report(report_file)
+    check_targets((report_file, json_file, csv_file), [preds])
     dataset, (scores,) = _scored([preds], gt, how)
     poses = _poses(scores, dataset) if pose else ()
     tables = [pose_table(scores, poses)] if poses else []
@@ -160,13 +161,14 @@ def compare(
     from kpbench.comparison import check_regression
     from kpbench.comparison import compare as compare_scores
     from kpbench.exhibits import difference_table, verdict_table
-    from kpbench.files import write_atomic
+    from kpbench.files import check_targets, write_atomic
     from kpbench.report import comparison_file, provenance
     from kpbench.tables import to_plain
 
     if len(files) < 2:
         raise click.UsageError("expected two or more predictions files")
     _check_report(report_file)
+    check_targets((report_file, json_file), files)
     dataset, (first, *others) = _scored(files, gt, how)
     comparisons = [compare_scores(first, other) for other in others]
     known = provenance(dataset, files, ["kpbench", *sys.argv[1:]])

@@ -6,6 +6,8 @@ most 500 points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 
@@ -25,10 +27,19 @@ def sift(image: UInt8) -> Detections:
     return _points(cv2.SIFT.create(nfeatures=500), image)
 
 
+SMALLEST_PX = 8
+"""Side of the smallest image that is looked at: of a few px OpenCV's pyramids have none."""
+
+
+def _strongest(point: cv2.KeyPoint) -> tuple[float, Sequence[float]]:
+    return -point.response, point.pt
+
+
 def _points(detector: cv2.Feature2D, image: UInt8) -> Detections:
     """Each place once: one with several directions is several features, but one point."""
-    found = sorted(detector.detect(to_grey(image), None), key=lambda p: (-p.response, p.pt))
+    grey = to_grey(image)
+    found = sorted(detector.detect(grey, None) if min(grey.shape) >= SMALLEST_PX else (), key=_strongest)
     strongest: dict[tuple[float, float], float] = {}
     for point in found:
         strongest.setdefault((point.pt[0], point.pt[1]), point.response)
-    return Detections(np.array(list(strongest)), np.array(list(strongest.values())), None)
+    return Detections(np.array(list(strongest)).reshape(-1, 2), np.array(list(strongest.values())), None)
