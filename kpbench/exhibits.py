@@ -59,10 +59,12 @@ def estimate(group: Group | None, metric: str) -> Estimate | None:
 
 
 def overview_table(runs: Sequence[Scores]) -> Table:
-    """A row a detector: the headline metrics over all images."""
+    """A row a detector: the headline metrics over all images; a note tells who failed on some."""
     metrics = (*PAPER_METRICS, "precision", "f1", "average_precision", "error_median_px", "error_p95_px")
     rows = [(run.name, *(estimate(run.overall, metric) for metric in metrics)) for run in runs]
-    return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows))
+    failed = [f"{run.name} failed on {len(said)} images" for run in runs if (said := run.detector.get("failures"))]
+    note = f"{', '.join(failed)}, which count as no detections." if failed else ""
+    return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows), note)
 
 
 def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simulated") -> Table:

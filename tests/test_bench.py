@@ -96,6 +96,8 @@ def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
     scores = json.loads((here / "out/scores/paper-v1/mine-frail.json").read_text())
     failures = scores["detector"]["failures"]
     assert 0 < len(failures) < 32
+    assert f"mine:frail failed on {len(failures)} images, which count as no detections" in done.stdout
+    assert "mine:frail failed on" in (here / "out/paper-v1.html").read_text()
     assert f"mine:frail on paper-v1: image_id {failures[0][0]}: ValueError: I do not like this one" in (
         done.stderr
     )
