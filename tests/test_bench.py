@@ -98,9 +98,7 @@ def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
     assert 0 < len(failures) < 32
     assert f"mine:frail failed on {len(failures)} images, which count as no detections" in done.stdout
     assert "mine:frail failed on" in (here / "out/paper-v1.html").read_text()
-    assert f"mine:frail on paper-v1: image_id {failures[0][0]}: ValueError: I do not like this one" in (
-        done.stderr
-    )
+    assert f"mine:frail on paper-v1: image_id {failures[0][0]}: ValueError: I do not like this one" in (done.stderr)
     assert f"kpbench: detectors failed on {len(failures)} images, which count as no detections\n" in done.stderr
     kept = read_predictions(next(here.glob("out/predictions/*/mine-frail-*.json")))
     assert len(kept) == 32
