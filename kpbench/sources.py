@@ -143,12 +143,16 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
     """Frames as a video, whole or not at all: OpenCV says nothing of a disk that is full."""
     part = target.with_name(f".{target.stem}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
+    sizes = set[tuple[int, int]]()
     written = 0
 
     def write_frame(name: str, image: UInt8) -> None:
         nonlocal written
+        size = (image.shape[1], image.shape[0])
+        sizes.add(size)
+        if len(sizes) > 1:  # which OpenCV would leave out
+            raise DataError(f"{target}: {name} is of another size than those before, expected a folder to draw into")
         if not video:
-            size = (image.shape[1], image.shape[0])
             video.append(cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size))
             if not video[0].isOpened():
                 raise DataError(f"{target}: cannot be written as a video, expected a name ending in .mp4")

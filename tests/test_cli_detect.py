@@ -353,3 +353,12 @@ def test_a_name_that_is_no_utf8_is_drawn_and_made_into_a_set(folder, plug):
 @pytest.mark.parametrize("name", ["orb", "sift"])
 def test_an_image_of_a_few_px_holds_no_features(name):
     assert [len(load_detector(name)(np.zeros(size, np.uint8))) for size in ((1, 1), (2, 3), (1, 50))] == [0, 0, 0]
+
+
+def test_images_of_several_sizes_make_no_video(folder, plug):
+    photos(folder, 2)
+    cv2.imwrite(str(folder / "photos" / "z.png"), np.zeros((30, 40, 3), np.uint8))
+    result = run("photos", "--detector", f"{plug}:brightest", "--overlay", "out.mp4")
+    assert result.exit_code == 1
+    assert result.stderr.startswith("kpbench: out.mp4: z.png is of another size than those before, expected a folder")
+    assert not (folder / "out.mp4").exists()

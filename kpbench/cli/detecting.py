@@ -67,7 +67,7 @@ def detect(
         check_apart(source, overlay)
     detector = _told(name, patches, threshold) if patches else name
     try:
-        run = _run(source, name, detector, threshold, overlay, bool(patches), workers)
+        run = _run(source, detector, threshold, overlay, workers)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{out} is not written; the same command starts anew") from None
     write_predictions(out, run.predictions)
@@ -80,15 +80,9 @@ def detect(
 
 
 def _run(
-    source: str,
-    name: str,
-    detector: str | LoadedDetector,
-    threshold: float | None,
-    overlay: Path | None,
-    told: bool,
-    workers: int | None,
+    source: str, detector: str | LoadedDetector, threshold: float | None, overlay: Path | None, workers: int | None
 ) -> Predicted:
-    """The detector ``name``, over a dataset or over images; ``told`` if it was told the designs."""
+    """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
     from kpbench.pipeline import predict, predict_images
     from kpbench.sources import open_images
@@ -99,9 +93,9 @@ def _run(
         with progress_bar(images.length, "detect") as progress:
             return predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
     dataset = open_dataset(source)
-    if not told and name in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
+    if detector in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
         click.echo(
-            f"kpbench: {source} holds other designs than {name} looks for; use template with --patches, "
+            f"kpbench: {source} holds other designs than {detector} looks for; use template with --patches, "
             "or weights trained on them",
             err=True,
         )
