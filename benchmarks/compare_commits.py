@@ -17,7 +17,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(subprocess.check_output(["git", "rev-parse", "--show-toplevel"], text=True, cwd=Path(__file__).parent).strip())
+ROOT = Path(
+    subprocess.check_output(["git", "rev-parse", "--show-toplevel"], text=True, cwd=Path(__file__).parent).strip()
+)
 COMMANDS = """
 synth --n 12 --seed 3 --size 320x240 --shard-size 5 --workers 1 --out synth
 synth --n 6 --seed 4 --size 320x240 --channels 3 --deteriorate ladder --distractors 3 --workers 1 --out ladder
@@ -63,7 +65,9 @@ def main() -> None:
         old, new = outputs(arguments.old, Path(folder, "old")), outputs(arguments.new, Path(folder, "new"))
     differing = [name for name in sorted(old.keys() | new.keys()) if old.get(name) != new.get(name)]
     for name in differing:
-        state = "differs" if name in old and name in new else "only in " + (arguments.old if name in old else arguments.new)
+        state = (
+            "differs" if name in old and name in new else "only in " + (arguments.old if name in old else arguments.new)
+        )
         print(f"{name}: {state}")
     print(f"{len(old)} files of {arguments.old}, {len(differing)} of them or of {arguments.new} not the same")
     sys.exit(bool(differing))

@@ -1,16 +1,15 @@
 """The benchmark: suites, detectors over them, scores; what is done is kept, and an interrupted run goes on.
 
 Everything lies in one folder, under names that hold what it was made from: a dataset's by its config, predictions
-by the dataset's fingerprint and the detector's. So nothing that is found there can be stale, and nothing has
-to be told to be resumed. Scoring takes seconds and is always done again.
+by the dataset's fingerprint and by the detector's version, settings and weights. So nothing that is found there
+can be stale, and nothing has to be told to be resumed. A detector that tells no version looks again at each call.
+Scoring takes seconds and is always done again.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import re
-import shlex
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ import numpy as np
 
 from kpbench import __version__, store
 from kpbench.design import shipped_patches
-from kpbench.detect import DETECTORS, PROGRAM, LoadedDetector, load_detector
+from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.files import check_own
 from kpbench.generation import generate
@@ -121,8 +120,10 @@ def bench(
                 datasets[config] = _make(config, Path(out) / "suites", workers, progress)
             dataset = datasets[config]
             folder = Path(out) / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
-            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_mark(name, detector)[:8]}.json"
+            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_mark(detector)[:8]}.json"
             runs.append((config, dataset, file))
+            if detector.identity is None:
+                _forget(file)
             if file.exists():
                 progress(len(dataset))
             else:
@@ -143,32 +144,16 @@ def _make(config: SuiteConfig, folder: Path, workers: int | None, progress: Prog
     return generate(config, place, workers=workers, resume=True, progress=progress).dataset
 
 
-def _mark(name: str, detector: LoadedDetector) -> str:
-    """Digest of what makes a detector what it is: its name, its version, and the files of its code and weights.
-
-    Of a detector from elsewhere only the file that it is named by is seen: if that reads others, its
-    ``version`` must tell.
-    """
-    if name.startswith(PROGRAM):
-        files = [Path(word) for word in shlex.split(name.removeprefix(PROGRAM)) if Path(word).is_file()]
-    elif name.endswith(".onnx"):
-        files = [Path(name), *_package()]
-    else:
-        module = importlib.import_module(DETECTORS.get(name, name).partition(":")[0])
-        own = [Path(module.__file__)] if module.__file__ else []
-        files = _package() if {*own} & {*_package()} else own
-    digest = hashlib.sha256(f"{name} {detector.version} {[p.digest for p in shipped_patches()]}".encode())
-    for file in files:
-        digest.update(hashlib.sha256(file.read_bytes()).digest())
-    return digest.hexdigest()
+def _mark(detector: LoadedDetector) -> str:
+    """Digest of a detector and of the designs that it looks for."""
+    parts = [detector.name, detector.identity, *(patch.digest for patch in shipped_patches())]
+    return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-@cache
-def _package() -> list[Path]:
-    """Everything that a shipped detector is made of, and more."""
-    here = Path(__file__).parent
-    code = [path for path in here.rglob("*.py") if path.parent.name != "cli"]
-    return sorted([*code, *(here / "weights").iterdir()])
+def _forget(file: Path) -> None:
+    """Remove predictions, whole or in parts."""
+    file.unlink(missing_ok=True)
+    shutil.rmtree(file.with_suffix(".parts"), ignore_errors=True)
 
 
 def _parts(dataset: store.Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:

@@ -6,6 +6,7 @@ or an object with a method ``detect``. There is nothing to inherit from.
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import sys
 from collections.abc import Callable, Sequence
@@ -59,6 +60,8 @@ class LoadedDetector:
     name, version : str
     run : function of an image.
     board : the board of tags that it looks for (:data:`kpbench.tags.TAG_BOARDS`), None for patches.
+    identity : SHA-256 of name, version, settings and weights: what a detector's kept detections are valid for. None if
+        it tells no version.
     run_many : function of several images, where that is faster than one by one, or None.
 
     Raises
@@ -71,6 +74,7 @@ class LoadedDetector:
     version: str
     run: Callable[[UInt8], Detections]
     board: str | None = None
+    identity: str | None = None
     run_many: Callable[[Sequence[UInt8]], list[Detections]] | None = None
 
     def __call__(self, image: UInt8) -> Detections:
@@ -113,7 +117,7 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
         return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
     if name.endswith(".onnx"):
         made = _with(threshold, _resolve(DETECTORS["superpoint"])(Path(name)))
-        return LoadedDetector(Path(name).stem, made.version, made.detect)
+        return LoadedDetector(Path(name).stem, made.version, made.detect, identity=_identity(name, made.version, made))
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
@@ -129,9 +133,28 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
     run = getattr(made, "detect", made)
     if not callable(run):
         raise DataError(f"detector {name!r}: {made!r} cannot be called and has no method detect(image)")
-    version = getattr(made, "version", __version__ if name in DETECTORS else "unknown")
+    version = getattr(made, "version", __version__ if name in DETECTORS else None)
     label = name if name in DETECTORS else str(getattr(made, "name", name))
-    return LoadedDetector(label, str(version), run, getattr(made, "board", None))
+    identity = None if version is None else _identity(name, str(version), made)
+    return LoadedDetector(label, str(version or "unknown"), run, getattr(made, "board", None), identity)
+
+
+def _identity(name: str, version: str, detector: Any) -> str:
+    """Digest of name, version, settings (plain public attributes) and weights (the file at ``path``)."""
+    values = vars(detector) if hasattr(detector, "__dict__") else {}
+    plain = {key: value for key, value in values.items() if key[0] != "_" and _is_plain(value)}
+    digest = hashlib.sha256(repr([name, version, sorted(plain.items())]).encode())
+    weights = getattr(detector, "path", None)
+    if isinstance(weights, Path) and weights.is_file():
+        digest.update(weights.read_bytes())
+    return digest.hexdigest()
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a value is a setting: a number, a text, nothing, or a sequence of such."""
+    if isinstance(value, (tuple, list)):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, (bool, int, float, str))
 
 
 def _with(threshold: float | None, detector: Any) -> Any:

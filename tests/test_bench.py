@@ -1,13 +1,17 @@
 import json
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import pytest
 from click.testing import CliRunner
 
+from kpbench import detect
 from kpbench.bench import bench, images_to_do
 from kpbench.cli import main
+from kpbench.detect import load_detector
 from kpbench.errors import DataError
 from kpbench.predictions import read_predictions
 from kpbench.suite import SuiteConfig, load_suite
@@ -22,6 +26,8 @@ from kpbench import Detections
 def corners(image):
     found = cv2.goodFeaturesToTrack(image, 20, 0.1, 8)[:, 0]
     return Detections(found, np.ones(len(found)))
+
+corners.version = "1"
 
 def frail(image):
     if image[0, 0] % 3 == 0:
@@ -83,9 +89,30 @@ def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, mon
     monkeypatch.setattr("kpbench.bench.detect_some", lambda *a: pytest.fail("looked again"))
     monkeypatch.setattr("kpbench.bench.generate", lambda *a, **k: pytest.fail("made again"))
     bench([SMALL], ["mine:corners"], "out", workers=1)
-    (here / "mine.py").write_text(DETECTOR.replace("20, 0.1", "10, 0.1"))
+    commented = DETECTOR + "# another comment\n"
+    for source, again in [(commented, False), (DETECTOR.replace('version = "1"', 'version = "2"'), True)]:
+        (here / "mine.py").write_text(source)
+        sys.modules.pop("mine")
+        with pytest.raises(pytest.fail.Exception, match="looked again") if again else nullcontext():
+            bench([SMALL], ["mine:corners"], "out", workers=1)
+
+
+def test_a_detector_without_a_version_looks_again_each_time(here, monkeypatch):
+    bench([SMALL], ["mine:frail"], "out", workers=1)
+    monkeypatch.setattr("kpbench.bench.detect_some", lambda *a: pytest.fail("looked again"))
     with pytest.raises(pytest.fail.Exception, match="looked again"):
-        bench([SMALL], ["mine:corners"], "out", workers=1)
+        bench([SMALL], ["mine:frail"], "out", workers=1)
+
+
+def test_version_settings_and_weights_are_what_a_detector_is(tmp_path):
+    small = load_detector("superpoint-small")
+    assert load_detector("superpoint-small").identity == small.identity
+    assert load_detector("superpoint-small", 0.4).identity != small.identity
+    weights = Path(detect.__file__).parent / "weights"
+    (tmp_path / "same.onnx").write_bytes((weights / "superpoint-small-int8.onnx").read_bytes())
+    mine = load_detector(str(tmp_path / "same.onnx")).identity
+    (tmp_path / "same.onnx").write_bytes((weights / "superpoint-int8.onnx").read_bytes())
+    assert load_detector(str(tmp_path / "same.onnx")).identity != mine
 
 
 def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
@@ -117,8 +144,8 @@ def test_the_command_tells_the_difference_to_the_paper(here):
     assert done.exit_code == 0, done.output
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "|" in line]
     paper = next(row for row in rows if row[:2] == ["detection", "paper"])
-    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners"])
-    less = next(row for row in rows if row[:2] == ["detection", "mine:corners less the paper"])
+    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners 1"])
+    less = next(row for row in rows if row[:2] == ["detection", "mine:corners 1 less the paper"])
     assert paper[2:] == ["photographs", "1.000", "0.986", "0.882", "0.605"]
     for theirs, value, between in zip(paper[3:], ours[3:], less[3:], strict=True):
         assert abs(float(value.split()[0]) - float(theirs) - float(between.split()[0])) < 0.0011

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import __version__, match, refine, sectors
+from kpbench import match, refine, sectors
 from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
@@ -28,6 +28,8 @@ __all__ = ["TemplateDetector", "crossings"]
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
+VERSION = "1"
+"""Version of the method. Raise it by one when detections change."""
 WINDOW_PX = 1.1
 """Standard deviation of the window, in px of a level: it sees 1 to 3 px around a place."""
 RADIAL = 0.7
@@ -138,7 +140,7 @@ class TemplateDetector:
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
     threshold: float = 0.3
     name: str = "template"
-    version: str = __version__
+    version: str = VERSION
 
     def __post_init__(self) -> None:
         for patch in self.patches:
