@@ -13,7 +13,6 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.errors import DesignError
-from kpbench.files import read_toml
+from kpbench.files import read_toml, shipped_folder
 from kpbench.keypoints import Float
 from kpbench.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
 
@@ -363,6 +362,4 @@ def _design_files(path: str | Path) -> list[Path]:
 @lru_cache(maxsize=1)
 def shipped_patches() -> tuple[Patch, ...]:
     """The four designs that ship with kpbench, in order of their ids."""
-    inside = resources.files("kpbench") / "patches"
-    folder = inside if inside.is_dir() else Path(__file__).parent.parent / "patches"
-    return load_patches(sorted(Path(str(entry)) for entry in folder.iterdir() if entry.name.endswith(".toml")))
+    return load_patches([shipped_folder("patches")])

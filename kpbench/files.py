@@ -17,6 +17,7 @@ from kpbench.errors import DataError, KpbenchError
 
 __all__ = [
     "IMAGE_SUFFIXES",
+    "PACKAGE",
     "check_own",
     "check_targets",
     "folder_at",
@@ -24,10 +25,24 @@ __all__ = [
     "is_local",
     "read_text",
     "read_toml",
+    "shipped_folder",
     "write_atomic",
 ]
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
+
+PACKAGE = Path(__file__).parent
+"""The folder of this package."""
+_IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": "configs"}
+
+
+def shipped_folder(name: str) -> Path:
+    """Find data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
+
+    In a checkout they lie where people edit them, in an installed package all in one folder.
+    """
+    installed = PACKAGE / "shipped" / name
+    return installed if installed.is_dir() else PACKAGE.parent / _IN_CHECKOUT[name]
 
 
 def image_files(folder: Path, but: Path | None = None) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kpbench import degrade, store
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
+from kpbench.files import PACKAGE, write_atomic
 from kpbench.keypoints import Detections, Predictions, UInt8
 from kpbench.preview import draw_detections
 from kpbench.scene import stream
@@ -144,8 +144,7 @@ def _sure(found: Detections, threshold: float | None) -> Detections:
 def _line_of(error: BaseException) -> str:
     """Where in the detector's own file an error was raised."""
     frames = traceback.extract_tb(error.__traceback__)
-    inside = Path(__file__).parent
-    own = [frame for frame in frames if inside not in Path(frame.filename).parents]
+    own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,7 @@ from kpbench.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
-from kpbench.files import read_toml
+from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry import Camera
 from kpbench.keypoints import Float
 from kpbench.scene import measure_contrast, stream
@@ -308,9 +307,7 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
 
 def shipped_suites() -> dict[str, Path]:
     """The suites that ship with kpbench: name to file."""
-    inside = resources.files("kpbench") / "suites"
-    folder = Path(str(inside)) if inside.is_dir() else Path(__file__).parent.parent / "benchmarks" / "suites"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in sorted(shipped_folder("suites").glob("*.toml"))}
 
 
 def load_suite(name: str) -> Suite:
