@@ -20,7 +20,7 @@ import torch
 import kpbench
 from kpbench.detect import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
-from kpbench.geometry import resize
+from kpbench.geometry.homography import resize
 from kpbench.network import SuperPoint
 from kpbench.recipe import NetworkConfig
 

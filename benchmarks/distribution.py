@@ -15,7 +15,7 @@ import numpy as np
 
 import kpbench
 from kpbench.design import shipped_patches
-from kpbench.geometry import projected_discs
+from kpbench.geometry.homography import projected_discs
 from kpbench.scene import Limits, random_placements, stream
 from kpbench.synth import SCENE
 

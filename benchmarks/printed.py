@@ -33,9 +33,9 @@ import readers
 from kpbench.board import grid_board, hexagon_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.draw import Page, Shape, dxf, pdf, png, px_per_mm, svg
+from kpbench.geometry.coverage import coverage
+from kpbench.geometry.outline import Line, flatten, move
 from kpbench.keypoints import Float
-from kpbench.outline import Line, flatten, move
-from kpbench.raster import coverage
 from kpbench.sheet import Paper, Sheet, board_sheet, patch_sheet
 
 Image.MAX_IMAGE_PIXELS = None

@@ -16,7 +16,7 @@ import sys
 import numpy as np
 
 from kpbench.design import Patch, shipped_patches
-from kpbench.geometry import project
+from kpbench.geometry.homography import project
 from kpbench.keypoints import Float
 from kpbench.scene import Limits, random_placements, render_scene
 

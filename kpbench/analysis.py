@@ -31,7 +31,7 @@ from kpbench.cells import (
     window_weights,
 )
 from kpbench.design import Patch
-from kpbench.geometry import Camera, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.geometry.homography import Camera, plane_to_camera, projected_disc, rotation_xyz
 from kpbench.keypoints import Float, UInt8
 
 __all__ = [

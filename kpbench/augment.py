@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from kpbench.degrade import albumentations
 from kpbench.errors import AugmentationError, DataError
 from kpbench.files import read_text
-from kpbench.geometry import project
+from kpbench.geometry.homography import project
 from kpbench.keypoints import UInt8
 from kpbench.scene import Placement
 

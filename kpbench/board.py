@@ -1,7 +1,7 @@
 """Boards: patches at known places in mm, built in (hexagon, grid) or from TOML.
 
 Board frame: mm, x right, y down, z away from the viewer, the origin is the board's centre
-(:mod:`kpbench.geometry`). ``Board.points_mm`` goes into ``cv2.solvePnP`` as it is.
+(:mod:`kpbench.geometry.homography`). ``Board.points_mm`` goes into ``cv2.solvePnP`` as it is.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ import numpy as np
 from kpbench.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
 from kpbench.files import read_toml
-from kpbench.geometry import project
+from kpbench.geometry.homography import project
+from kpbench.geometry.outline import cos_sin_deg
 from kpbench.keypoints import Float
-from kpbench.outline import cos_sin_deg
 
 __all__ = ["Board", "BoardKeypoint", "CameraBoard", "find_patch", "grid_board", "hexagon_board", "load_board"]
 

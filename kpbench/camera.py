@@ -2,7 +2,7 @@
 
 A pose is found from what the experiments fix: the board's share of the image. Ink and paper are
 projected as outlines and painted by exact area coverage, so that a board of 0.5 % of the image is not
-aliased. See :mod:`kpbench.geometry` for the frames.
+aliased. See :mod:`kpbench.geometry.homography` for the frames.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from scipy.optimize import brentq
 
 from kpbench.board import CameraBoard
 from kpbench.errors import DataError
-from kpbench.geometry import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.geometry.coverage import Box, box_around, coverage
+from kpbench.geometry.homography import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.geometry.outline import flatten, rectangle
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
-from kpbench.outline import flatten, rectangle
-from kpbench.raster import Box, box_around, coverage
 from kpbench.scene import Mask, Rendered, inside_image, measure_contrast
 
 __all__ = ["Look", "Pose", "board_keypoints", "outline_px", "polygon_area", "pose_board", "render_board"]

@@ -26,8 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.design import Patch
+from kpbench.geometry.coverage import box_around, coverage
 from kpbench.keypoints import Float
-from kpbench.raster import box_around, coverage
 
 __all__ = ["Float32", "Grid", "attitudes", "blurred", "images", "moments", "seen_cells", "window_weights"]
 
@@ -95,7 +95,7 @@ class Grid:
         """Every cell as a polygon of the patch frame; the outermost ring reaches to ``reach`` at least.
 
         Neighbours share the vertices of their common border, so that cells of one ink add up without a
-        seam. ``tolerance`` is in disc radii, see :func:`kpbench.outline.flatten`.
+        seam. ``tolerance`` is in disc radii, see :func:`kpbench.geometry.outline.flatten`.
         """
         radii = np.append(0.0, self.radii)
         radii[-1] = max(radii[-1], reach)

@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
+from kpbench.geometry.coverage import Box, box_around, coverage
 from kpbench.keypoints import Float, UInt8
-from kpbench.raster import Box, box_around, coverage
 from kpbench.scene import Mask, inside_image
 
 __all__ = [

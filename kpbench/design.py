@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from kpbench.errors import DesignError
 from kpbench.files import read_toml, shipped_folder
+from kpbench.geometry.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
 from kpbench.keypoints import Float
-from kpbench.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
 
 __all__ = ["Patch", "SemiCircle", "load_patch", "load_patches", "parse_patch", "shipped_patches"]
 
@@ -154,7 +154,7 @@ class Patch:
 
 @lru_cache(maxsize=256)
 def unit_polygons(patch: Patch, tolerance: float) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """(black, whole patch) as polygons of the patch frame, see :func:`kpbench.outline.flatten`."""
+    """(black, whole patch) as polygons of the patch frame, see :func:`kpbench.geometry.outline.flatten`."""
     return tuple(flatten(patch.black_region, tolerance)), tuple(flatten(patch.disc_region, tolerance))
 
 

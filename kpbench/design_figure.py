@@ -10,7 +10,7 @@ from kpbench.analysis import SIZES_PX, Analysis, DesignReport
 from kpbench.cells import SEEN_PX, Grid, images
 from kpbench.design import Patch
 from kpbench.draw import Page, Shape, Text
-from kpbench.outline import Arc, circle, move, rectangle
+from kpbench.geometry.outline import Arc, circle, move, rectangle
 
 __all__ = ["design_figure"]
 

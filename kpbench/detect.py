@@ -21,7 +21,7 @@ import numpy as np
 
 from kpbench import __version__
 from kpbench.errors import DataError
-from kpbench.geometry import suppress
+from kpbench.geometry.homography import suppress
 from kpbench.keypoints import Detections, UInt8
 from kpbench.program import run_program
 

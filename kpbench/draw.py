@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DesignError
-from kpbench.outline import Arc, Contour, Line, Region, flatten
+from kpbench.geometry.outline import Arc, Contour, Line, Region, flatten
 
 __all__ = ["INK", "WRITERS", "Page", "Shape", "Text", "mirror", "px_per_mm"]
 
@@ -224,7 +224,7 @@ def png(page: Page, dpi: float) -> bytes:
     """
     from PIL import Image
 
-    from kpbench.raster import box_around, coverage
+    from kpbench.geometry.coverage import box_around, coverage
 
     scale = px_per_mm(dpi)
     width, height = round(page.width * scale), round(page.height * scale)

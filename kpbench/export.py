@@ -22,7 +22,7 @@ from kpbench.design import parse_patch
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.geometry import resize
+from kpbench.geometry.homography import resize
 from kpbench.network import CELL, SuperPoint
 from kpbench.runtime import open_session
 from kpbench.samples import SampleConfig, load_photos, make_batch

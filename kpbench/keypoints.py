@@ -44,7 +44,7 @@ class Detections:
 
     Attributes
     ----------
-    xy : ndarray of shape (n, 2), float64, px in the pixel convention of :mod:`kpbench.geometry`.
+    xy : ndarray of shape (n, 2), float64, px in the pixel convention of :mod:`kpbench.geometry.homography`.
     score : ndarray of shape (n,), float64, higher is surer.
     patch_id : ndarray of shape (n,), int64, or None from a detector that tells no identities.
 
@@ -134,7 +134,7 @@ class Predictions:
     ----------
     image_id : ndarray of shape (N,), int64, unique, 0 or more, in any order.
     offsets : ndarray of shape (N + 1,), int64.
-    xy : ndarray of shape (K, 2), float64, px in the pixel convention of :mod:`kpbench.geometry`.
+    xy : ndarray of shape (K, 2), float64, px in the pixel convention of :mod:`kpbench.geometry.homography`.
     score : ndarray of shape (K,), float64, higher is surer.
     patch_id : ndarray of shape (K,), int64, 0 or more, or None from a detector that tells no identities.
     detector : dict

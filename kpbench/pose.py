@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.geometry import Camera
+from kpbench.geometry.homography import Camera
 from kpbench.keypoints import Float
 from kpbench.scoring import Scores
 from kpbench.tally import Tally

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.design import Patch
+from kpbench.geometry.coverage import Box, coverage
 from kpbench.keypoints import Float
-from kpbench.raster import Box, coverage
 
 __all__ = ["Fit", "fit"]
 

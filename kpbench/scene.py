@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from kpbench.design import Patch, unit_polygons
 from kpbench.errors import DataError
-from kpbench.geometry import projected_discs
+from kpbench.geometry.coverage import Box, box_around, edge_coverage
+from kpbench.geometry.homography import projected_discs
 from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
-from kpbench.raster import Box, box_around, edge_coverage
 
 __all__ = [
     "Limits",

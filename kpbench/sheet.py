@@ -22,7 +22,7 @@ from kpbench.design import Patch
 from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
-from kpbench.outline import Line, Region, circle, move, rectangle
+from kpbench.geometry.outline import Line, Region, circle, move, rectangle
 from kpbench.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
 from kpbench.tiling import Tile, tiles_of
 

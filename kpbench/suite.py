@@ -24,7 +24,7 @@ from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder
-from kpbench.geometry import Camera
+from kpbench.geometry.homography import Camera
 from kpbench.keypoints import Float
 from kpbench.scene import measure_contrast, stream
 from kpbench.tags import TAG_BOARDS, tag_board

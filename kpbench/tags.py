@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.board import HEXAGON_DIAMETER
+from kpbench.geometry.outline import circle, flatten
 from kpbench.keypoints import Float
-from kpbench.outline import circle, flatten
 
 __all__ = ["TAG_BOARDS", "Corner", "TagBoard", "charuco_pattern", "dictionary", "tag_board"]
 

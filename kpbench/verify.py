@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from kpbench import match, refine
 from kpbench.design import Patch
-from kpbench.geometry import suppress
+from kpbench.geometry.homography import suppress
 from kpbench.keypoints import Float, UInt8
 from kpbench.match import Picture
 from kpbench.runtime import Session, open_session

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from kpbench.board import Board, BoardKeypoint, find_patch, grid_board, hexagon_board, load_board
 from kpbench.design import parse_patch, shipped_patches
 from kpbench.errors import DesignError
-from kpbench.geometry import project
+from kpbench.geometry.homography import project
 
 PATCHES = shipped_patches()
 

@@ -9,7 +9,7 @@ from kpbench.board import hexagon_board
 from kpbench.camera import Look, Pose, board_keypoints, outline_px, polygon_area, pose_board, render_board, to_px
 from kpbench.design import shipped_patches
 from kpbench.errors import DataError
-from kpbench.geometry import Camera, project, rotation_xyz
+from kpbench.geometry.homography import Camera, project, rotation_xyz
 
 BOARD = hexagon_board(shipped_patches()[0], 187.5)
 PAPER = Camera(1624, 1240, 4 / 0.0045)

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from kpbench.design import Patch, SemiCircle, load_patches, parse_patch, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
-from kpbench.raster import box_around, coverage
+from kpbench.geometry.coverage import box_around, coverage
 
 semicircles = st.builds(
     SemiCircle,

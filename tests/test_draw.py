@@ -15,7 +15,7 @@ from PIL import Image
 import kpbench.draw
 from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, dxf, mirror, pdf, png, px_per_mm, svg
 from kpbench.errors import DesignError
-from kpbench.outline import Arc, Line, circle, move, rectangle
+from kpbench.geometry.outline import Arc, Line, circle, move, rectangle
 
 RADIUS, AT = 15.0, (40.3, 61.7)
 HALF_DISC = ((Arc(0, 0, 1, 0, 180), Line(-1, 0, 1, 0)),)

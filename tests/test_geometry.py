@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.geometry import Camera, jacobian, plane_to_camera, project, projected_disc, rotation_xyz
+from kpbench.geometry.homography import Camera, jacobian, plane_to_camera, project, projected_disc, rotation_xyz
 
 angles = st.floats(-70, 70)
 

@@ -9,7 +9,7 @@ import pytest
 from kpbench import degrade
 from kpbench.degrade import LADDER, apply, climb
 from kpbench.errors import DataError
-from kpbench.raster import coverage
+from kpbench.geometry.coverage import coverage
 
 RUNGS = [(effect, level) for effect, rungs in LADDER.items() for level in rungs.levels]
 BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")

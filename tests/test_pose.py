@@ -8,7 +8,7 @@ import pytest
 
 from kpbench.errors import DataError
 from kpbench.exhibits import pose_table
-from kpbench.geometry import Camera
+from kpbench.geometry.homography import Camera
 from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
 from kpbench.pose import PoseErrors, pose_errors, pose_groups
 from kpbench.report import scores_file

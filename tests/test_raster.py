@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.outline import circle, flatten, rectangle
-from kpbench.raster import box_around, coverage
+from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.outline import circle, flatten, rectangle
 
 coordinate = st.floats(-30, 30)
 

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from kpbench.crops import Disc, _paint_all, _poses
 from kpbench.design import shipped_patches
 from kpbench.errors import DataError
-from kpbench.geometry import projected_disc
+from kpbench.geometry.homography import projected_disc
 from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
 from kpbench.scene import Limits, Placement
 

@@ -6,7 +6,7 @@ from kpbench.board import hexagon_board
 from kpbench.camera import Look, board_keypoints, pose_board, render_board
 from kpbench.design import shipped_patches
 from kpbench.detect import load_detector
-from kpbench.geometry import Camera
+from kpbench.geometry.homography import Camera
 from kpbench.suite import SuiteConfig, load_suite
 from kpbench.tags import TAG_BOARDS, tag_board
 

@@ -1,0 +1,1 @@
+"""Geometry: frames, homographies, outlines and exact coverage; *the* pixel convention."""
