@@ -22,9 +22,9 @@ import numpy as np
 
 from kpbench.degrade import LADDER, apply, climb
 from kpbench.design import shipped_patches
-from kpbench.keypoints import Float, UInt8
 from kpbench.scene import Placement, render_scene
 from kpbench.suite import SuiteConfig, load_suite
+from kpbench.types import Float, UInt8
 
 SIDE, RADIUS, BLACK, WHITE = 256, 45.0, 50, 200
 RANDOM_FIELD = ("noise", "low-light")

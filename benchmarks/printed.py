@@ -35,8 +35,8 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.draw import Page, Shape, dxf, pdf, png, px_per_mm, svg
 from kpbench.geometry.coverage import coverage
 from kpbench.geometry.outline import Line, flatten, move
-from kpbench.keypoints import Float
 from kpbench.sheet import Paper, Sheet, board_sheet, patch_sheet
+from kpbench.types import Float
 
 Image.MAX_IMAGE_PIXELS = None
 

@@ -25,10 +25,10 @@ import msgspec
 import numpy as np
 
 from kpbench.coco import open_coco
-from kpbench.keypoints import KEYPOINT_DTYPE, Truth
 from kpbench.predictions import Predictions, read_predictions, write_predictions
 from kpbench.scoring import evaluate, summarise
 from kpbench.tally import Settings, tally
+from kpbench.types import KEYPOINT_DTYPE, Truth
 
 KEYPOINTS, CONDITIONS, RUNGS = 5, 5, 4
 LANE_PX = 640 / KEYPOINTS  # each keypoint of an image has its own, so none are within reach of one detection

@@ -35,8 +35,8 @@ from kpbench.detectors.superpoint import (
     keypoint_probability,
     locate,
 )
-from kpbench.keypoints import Float, UInt8
 from kpbench.samples import SampleConfig, load_photos, make_batch
+from kpbench.types import Float, UInt8
 from kpbench.workers import one_thread
 
 SIDE = 24

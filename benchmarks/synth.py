@@ -37,8 +37,8 @@ import numpy as np
 from kpbench.background import PhotoFolder, decode_photo
 from kpbench.design import Patch, shipped_patches
 from kpbench.generation import generate
-from kpbench.keypoints import UInt8
 from kpbench.synth import SynthConfig
+from kpbench.types import UInt8
 
 WIDTH, HEIGHT = 640, 480
 PATCH_PX = 512

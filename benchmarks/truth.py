@@ -17,8 +17,8 @@ import numpy as np
 
 from kpbench.design import Patch, shipped_patches
 from kpbench.geometry.homography import project
-from kpbench.keypoints import Float
 from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.types import Float
 
 SUB = 10
 

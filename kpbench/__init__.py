@@ -12,12 +12,12 @@ from typing import Any
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Detections": "keypoints",
-    "KEYPOINT_DTYPE": "keypoints",
+    "Detections": "types",
+    "KEYPOINT_DTYPE": "types",
     "KpbenchError": "errors",
     "Patch": "design",
     "Predictions": "predictions",
-    "Truth": "keypoints",
+    "Truth": "types",
     "compare": "comparison",
     "generate": "generation",
     "load_detector": "detect",

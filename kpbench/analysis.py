@@ -32,7 +32,7 @@ from kpbench.cells import (
 )
 from kpbench.design import Patch
 from kpbench.geometry.homography import Camera, plane_to_camera, projected_disc, rotation_xyz
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = [
     "PAIR_STEPS",

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["CLUTTER", "DUPLICATE", "MATCHED", "NEAR_MISS", "Matches", "match", "matched_within"]
 

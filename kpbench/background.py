@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = ["Background", "PhotoFolder", "procedural"]
 

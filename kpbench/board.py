@@ -19,7 +19,7 @@ from kpbench.errors import DesignError
 from kpbench.files import read_toml
 from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Board", "BoardKeypoint", "CameraBoard", "find_patch", "grid_board", "hexagon_board", "load_board"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtrit
 
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Interval", "by_scene", "intervals"]
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.bootstrap import Interval, by_scene, intervals
-from kpbench.keypoints import Float
 from kpbench.metrics import SUMS
 from kpbench.scoring import Scores
+from kpbench.types import Float
 
 __all__ = ["LIMIT", "Breakpoint", "breakpoints"]
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.files import write_atomic
-from kpbench.keypoints import Float, UInt8
 from kpbench.preview import contact_sheet, draw_keypoints
 from kpbench.store import Dataset
+from kpbench.types import Float, UInt8
 
 __all__ = ["FILES", "Histogram", "facts", "histograms", "names", "overview", "write_card"]
 

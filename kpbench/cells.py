@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from kpbench.design import Patch
 from kpbench.geometry.coverage import box_around, coverage
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Float32", "Grid", "attitudes", "blurred", "images", "moments", "seen_cells", "window_weights"]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from kpbench.columns import from_table
 from kpbench.errors import DataError, PredictionsError
-from kpbench.keypoints import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 from kpbench.pieces import cut, kind, parse, records, typed, without_gc
+from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 __all__ = ["CocoDataset", "coco_results", "open_coco"]
 

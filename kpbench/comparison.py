@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import DataError, GateFailed
-from kpbench.keypoints import Float
 from kpbench.metrics import LABELS, PAPER_METRICS, SUMS, ratios
 from kpbench.scoring import Scores
+from kpbench.types import Float
 
 __all__ = ["Comparison", "Difference", "check_regression", "compare"]
 

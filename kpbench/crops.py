@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from kpbench import degrade
 from kpbench.design import Patch
 from kpbench.geometry.homography import projected_discs, resize
-from kpbench.keypoints import Float, UInt8
 from kpbench.lookalikes import draw_lookalikes
 from kpbench.scene import Limits, Placement, paint, random_poses, rasterise
+from kpbench.types import Float, UInt8
 
 __all__ = ["MOST_KEYPOINTS", "make_crops", "no_keypoints", "window"]
 

@@ -20,8 +20,8 @@ import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import Box, box_around, coverage
-from kpbench.keypoints import Float, UInt8
 from kpbench.scene import Mask, inside_image
+from kpbench.types import Float, UInt8
 
 __all__ = [
     "LADDER",

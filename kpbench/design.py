@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from kpbench.errors import DesignError
 from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Patch", "SemiCircle", "load_patch", "load_patches", "parse_patch", "shipped_patches"]
 

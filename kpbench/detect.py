@@ -1,6 +1,6 @@
 """Detectors: what one is, how one is loaded, and the pieces that several share.
 
-A detector is anything that takes an image and returns :class:`~kpbench.keypoints.Detections`: a function,
+A detector is anything that takes an image and returns :class:`~kpbench.types.Detections`: a function,
 or an object with a method ``detect``. There is nothing to inherit from.
 """
 
@@ -22,8 +22,8 @@ import numpy as np
 from kpbench import __version__
 from kpbench.errors import DataError
 from kpbench.geometry.homography import suppress
-from kpbench.keypoints import Detections, UInt8
 from kpbench.program import run_program
+from kpbench.types import Detections, UInt8
 
 __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
 

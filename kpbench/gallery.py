@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS
-from kpbench.keypoints import UInt8
 from kpbench.metrics import SUMS
 from kpbench.tally import Tally
+from kpbench.types import UInt8
 
 __all__ = ["Case", "Mark", "worst_cases"]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from kpbench.errors import PredictionsError
-from kpbench.keypoints import Predictions
 from kpbench.pieces import kind
+from kpbench.types import Predictions
 
 __all__ = ["SCHEMA", "header_of", "read_header"]
 

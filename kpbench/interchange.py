@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from kpbench.card import names, write_card
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.keypoints import KEYPOINT_DTYPE, UInt8
 from kpbench.store import Dataset
+from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 __all__ = ["FORMATS", "export_dataset"]
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from kpbench.design import Patch, unit_polygons
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = ["draw_lookalikes"]
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.design import Patch
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = [
     "Bank",

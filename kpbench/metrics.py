@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = [
     "COUNTS",

@@ -18,10 +18,10 @@ from kpbench import degrade, store
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic
-from kpbench.keypoints import Detections, Predictions, UInt8
+from kpbench.images import Source, image_writer
 from kpbench.preview import draw_detections
 from kpbench.scene import stream
-from kpbench.sources import Source, image_writer
+from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_pieces
 
 __all__ = ["Predicted", "degrade_files", "detect_some", "predict", "predict_images"]
@@ -94,7 +94,7 @@ def predict_images(
 ) -> Predicted:
     """Run a detector over images that have no truth; ``image_id`` is their place in the source.
 
-    Parameters and errors are those of :func:`predict`; ``source`` is from :func:`kpbench.sources.open_images`.
+    Parameters and errors are those of :func:`predict`; ``source`` is from :func:`kpbench.images.open_images`.
     """
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[Found](), list[str]()
@@ -180,7 +180,7 @@ def degrade_files(
 
     Parameters
     ----------
-    source : from :func:`kpbench.sources.open_images`; what cannot be decoded is named at the end.
+    source : from :func:`kpbench.images.open_images`; what cannot be decoded is named at the end.
     out : folder, made if it is not there; not the one that the images are in.
     steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
     seed : the n-th image written is a function of the n-th image, the steps, the seed and n.

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.geometry.homography import Camera
-from kpbench.keypoints import Float
 from kpbench.scoring import Scores
 from kpbench.tally import Tally
+from kpbench.types import Float
 
 __all__ = ["PoseErrors", "PoseGroup", "pose_errors", "pose_groups"]
 

@@ -1,6 +1,6 @@
 """Predictions files: what a detector found in every image of a dataset, in and out.
 
-In memory the predictions are columns (:class:`kpbench.keypoints.Predictions`), so that a million images are a handful
+In memory the predictions are columns (:class:`kpbench.types.Predictions`), so that a million images are a handful
 of arrays. On disk they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or
 ``.h5``, all with the same content; ``docs/predictions.md`` describes each.
 """
@@ -13,8 +13,8 @@ from pathlib import Path
 from kpbench import columns, records
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import write_atomic
-from kpbench.keypoints import Predictions
 from kpbench.pieces import without_gc
+from kpbench.types import Predictions
 
 __all__ = ["Predictions", "check_target", "read_predictions", "write_predictions"]
 

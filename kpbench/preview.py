@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.keypoints import Detections, UInt8
+from kpbench.types import Detections, UInt8
 
 __all__ = ["contact_sheet", "draw_detections", "draw_keypoints"]
 
@@ -23,7 +23,7 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
-    keypoints : ndarray of :data:`kpbench.keypoints.KEYPOINT_DTYPE`
+    keypoints : ndarray of :data:`kpbench.types.KEYPOINT_DTYPE`
     scale : output px per image px
     """
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST

@@ -11,8 +11,8 @@ from pathlib import Path
 import cv2
 
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections, UInt8
 from kpbench.predictions import read_predictions
+from kpbench.types import Detections, UInt8
 
 __all__ = ["run_program"]
 

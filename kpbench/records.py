@@ -13,8 +13,8 @@ import numpy as np
 from kpbench.coco import coco_results
 from kpbench.errors import PredictionsError
 from kpbench.header import SCHEMA, header_of, read_header
-from kpbench.keypoints import Float, Int, Misfit, Predictions, offsets_of
 from kpbench.pieces import PIECE_BYTES, cut, kind, parse, records, typed
+from kpbench.types import Float, Int, Misfit, Predictions, offsets_of
 
 __all__ = ["read_json", "read_jsonl", "write_json", "write_jsonl"]
 

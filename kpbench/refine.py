@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kpbench.design import Patch
 from kpbench.geometry.coverage import Box, coverage
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Fit", "fit"]
 

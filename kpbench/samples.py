@@ -24,8 +24,8 @@ from kpbench.background import PhotoFolder, decode_photo, procedural
 from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.design import Patch
 from kpbench.errors import DataError
-from kpbench.keypoints import UInt8
 from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.types import UInt8
 from kpbench.workers import end_with_parent, one_thread
 
 __all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]

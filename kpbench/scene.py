@@ -15,7 +15,7 @@ from kpbench.design import Patch, unit_polygons
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import Box, box_around, edge_coverage
 from kpbench.geometry.homography import projected_discs
-from kpbench.keypoints import KEYPOINT_DTYPE, Float, UInt8
+from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 __all__ = [
     "Limits",

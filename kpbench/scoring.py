@@ -26,9 +26,9 @@ from numpy.typing import NDArray
 from kpbench.assignment import MATCHED, matched_within
 from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import GateFailed, PredictionsError
-from kpbench.keypoints import Detections, Predictions, Truth
 from kpbench.metrics import COUNTS, METRICS, SUMS, error_metrics, precision_recall, ratios
 from kpbench.tally import Settings, Tally, tally
+from kpbench.types import Detections, Predictions, Truth
 
 __all__ = ["Group", "Scores", "check_gates", "evaluate", "score", "summarise"]
 

@@ -33,7 +33,7 @@ from kpbench.analysis import (
 )
 from kpbench.cells import Float32, Grid
 from kpbench.design import Patch, SemiCircle
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = ["FAMILY_GRID", "Family", "SearchResult", "best_sets", "enumerate_family", "search"]
 

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from kpbench.design import Patch
-from kpbench.keypoints import Float
 from kpbench.match import (
     ANGLES,
     TURNS,
@@ -32,6 +31,7 @@ from kpbench.match import (
     short_axis,
     soft_ink,
 )
+from kpbench.types import Float
 
 __all__ = ["RING_PX", "alike", "extend", "likeness", "search"]
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
-from kpbench.keypoints import KEYPOINT_DTYPE, Truth, UInt8
+from kpbench.types import KEYPOINT_DTYPE, Truth, UInt8
 
 __all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_manifest"]
 

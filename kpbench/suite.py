@@ -25,9 +25,9 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry.homography import Camera
-from kpbench.keypoints import Float
 from kpbench.scene import measure_contrast, stream
 from kpbench.tags import TAG_BOARDS, tag_board
+from kpbench.types import Float
 
 __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "board_in_view", "load_suite", "shipped_suites"]
 

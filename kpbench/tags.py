@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from kpbench.board import HEXAGON_DIAMETER
 from kpbench.geometry.outline import circle, flatten
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["TAG_BOARDS", "Corner", "TagBoard", "charuco_pattern", "dictionary", "tag_board"]
 

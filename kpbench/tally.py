@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from kpbench.assignment import DUPLICATE, NEAR_MISS, Matches, match
 from kpbench.errors import DataError, PredictionsError
-from kpbench.keypoints import Float, Predictions, Truth
+from kpbench.types import Float, Predictions, Truth
 
 __all__ = ["Settings", "Tally", "tally"]
 

@@ -32,10 +32,10 @@ from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.keypoints import UInt8
 from kpbench.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
 from kpbench.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.samples import Batch, Job, load_photos, make_batch, stream
+from kpbench.types import UInt8
 
 __all__ = ["State", "designs_digest", "evaluate", "network_of", "read_checkpoint", "train", "validation_set"]
 

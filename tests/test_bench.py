@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench import detect
-from kpbench.bench import bench, images_to_do
+from kpbench.benchmark import bench, images_to_do
 from kpbench.cli import main
 from kpbench.detect import load_detector
 from kpbench.errors import DataError
@@ -86,8 +86,8 @@ def test_interrupted_at_three_places_and_resumed_is_the_same(here):
 
 def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, monkeypatch):
     bench([SMALL], ["mine:corners"], "out", workers=1)
-    monkeypatch.setattr("kpbench.bench.detect_some", lambda *a: pytest.fail("looked again"))
-    monkeypatch.setattr("kpbench.bench.generate", lambda *a, **k: pytest.fail("made again"))
+    monkeypatch.setattr("kpbench.benchmark.detect_some", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.generate", lambda *a, **k: pytest.fail("made again"))
     bench([SMALL], ["mine:corners"], "out", workers=1)
     commented = DETECTOR + "# another comment\n"
     for source, again in [(commented, False), (DETECTOR.replace('version = "1"', 'version = "2"'), True)]:
@@ -99,7 +99,7 @@ def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, mon
 
 def test_a_detector_without_a_version_looks_again_each_time(here, monkeypatch):
     bench([SMALL], ["mine:frail"], "out", workers=1)
-    monkeypatch.setattr("kpbench.bench.detect_some", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.detect_some", lambda *a: pytest.fail("looked again"))
     with pytest.raises(pytest.fail.Exception, match="looked again"):
         bench([SMALL], ["mine:frail"], "out", workers=1)
 

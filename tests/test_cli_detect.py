@@ -14,13 +14,13 @@ from kpbench.design import load_patches
 from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.generation import generate
-from kpbench.keypoints import Detections
+from kpbench.images import Source, image_writer
 from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
 from kpbench.preview import draw_detections
 from kpbench.scene import Limits
-from kpbench.sources import Source, image_writer
 from kpbench.synth import SynthConfig
+from kpbench.types import Detections
 
 MODULE = """
 import numpy as np

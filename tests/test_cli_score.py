@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.files import write_atomic
 from kpbench.interchange import export_dataset
-from kpbench.keypoints import KEYPOINT_DTYPE, Detections
 from kpbench.metrics import COUNTS, METRICS
 from kpbench.predictions import Predictions, write_predictions
 from kpbench.store import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_manifest
+from kpbench.types import KEYPOINT_DTYPE, Detections
 
 
 def write_dataset(folder, images, condition="", seed=0):

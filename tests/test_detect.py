@@ -6,7 +6,7 @@ import pytest
 from kpbench import pipeline
 from kpbench.detect import LoadedDetector, load_detector, suppress, to_grey
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections
+from kpbench.types import Detections
 
 MODULE = """
 import numpy as np

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from kpbench.assignment import match
-from kpbench.keypoints import KEYPOINT_DTYPE, Truth
 from kpbench.predictions import Predictions
 from kpbench.scoring import evaluate
 from kpbench.tally import Settings
+from kpbench.types import KEYPOINT_DTYPE, Truth
 
 CASES = 1000
 RADII, LEVELS = np.array([0.0, 0.5, 1.0, 2.0]), np.array([0.0, 0.25, 0.5, 1e300])

@@ -9,11 +9,11 @@ import pytest
 from kpbench.errors import DataError
 from kpbench.exhibits import pose_table
 from kpbench.geometry.homography import Camera
-from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
 from kpbench.pose import PoseErrors, pose_errors, pose_groups
 from kpbench.report import scores_file
 from kpbench.scoring import score
 from kpbench.suite import SuiteConfig, board_in_view, load_suite
+from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 CAMERA = Camera(640, 480, 500.0, (0.02, -0.01, 0.0, 0.0, 0.0))
 BOARD = np.array([[np.cos(a), np.sin(a), 0] for a in np.arange(6) * np.pi / 3]) * 60.0

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from kpbench import pieces, records
 from kpbench.errors import DataError, PredictionsError
-from kpbench.keypoints import Detections
 from kpbench.predictions import Predictions, read_predictions, write_predictions
+from kpbench.types import Detections
 
 FORMATS = ["json", "jsonl", "csv", "parquet", "h5"]
 HEADER = {"schema": "kpbench.predictions/1"}

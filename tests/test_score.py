@@ -12,11 +12,11 @@ from scipy import stats
 from kpbench import assignment, bootstrap
 from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
 from kpbench.errors import DataError, GateFailed, PredictionsError
-from kpbench.keypoints import KEYPOINT_DTYPE, Detections, Truth
 from kpbench.metrics import METRICS
 from kpbench.predictions import Predictions
 from kpbench.scoring import check_gates, evaluate, score
 from kpbench.tally import Settings
+from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 
 def truth_of(images, condition=None, rung=None, scene=None, image_id=None):

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from kpbench import store
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.keypoints import KEYPOINT_DTYPE
 from kpbench.store import (
     Sample,
     ShardEntry,
@@ -20,6 +19,7 @@ from kpbench.store import (
     sha256_of,
     write_manifest,
 )
+from kpbench.types import KEYPOINT_DTYPE
 
 CONFIG = {"seed": 3, "kind": "test"}
 

@@ -12,8 +12,8 @@ import click
 
 if TYPE_CHECKING:
     from kpbench.analysis import Analysis
-    from kpbench.keypoints import UInt8
     from kpbench.search import SearchResult
+    from kpbench.types import UInt8
 
 __all__ = ["analyze_patches"]
 

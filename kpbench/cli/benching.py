@@ -12,7 +12,7 @@ import click
 from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
 
 if TYPE_CHECKING:
-    from kpbench.bench import Benched
+    from kpbench.benchmark import Benched
 
 __all__ = ["bench"]
 
@@ -64,8 +64,8 @@ def bench(
       kpbench bench --quick --suite paper-v1 --suite extended-v1 --detector template --detector aruco
       kpbench bench --images 50 --detector my_module:MyDetector --only blur
     """
-    from kpbench.bench import bench as run_bench
-    from kpbench.bench import images_to_do
+    from kpbench.benchmark import bench as run_bench
+    from kpbench.benchmark import images_to_do
     from kpbench.cli.progress import progress_bar
     from kpbench.suite import SuiteConfig, load_suite
 

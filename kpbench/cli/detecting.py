@@ -59,8 +59,8 @@ def detect(
       kpbench detect photos --detector template --patches my-patch.toml
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
+    from kpbench.images import check_apart
     from kpbench.predictions import check_target, write_predictions
-    from kpbench.sources import check_apart
 
     check_target(out)
     if overlay is not None:
@@ -84,8 +84,8 @@ def _run(
 ) -> Predicted:
     """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
+    from kpbench.images import open_images
     from kpbench.pipeline import predict, predict_images
-    from kpbench.sources import open_images
     from kpbench.store import open_dataset
 
     if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):

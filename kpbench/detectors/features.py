@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from kpbench.detect import to_grey
-from kpbench.keypoints import Detections, UInt8
+from kpbench.types import Detections, UInt8
 
 __all__ = ["orb", "sift"]
 

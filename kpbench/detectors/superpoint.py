@@ -22,8 +22,8 @@ from kpbench.design import parse_patch
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
 from kpbench.geometry.homography import resize, suppress
-from kpbench.keypoints import Detections, Float, UInt8
 from kpbench.runtime import on_gpu, open_session
+from kpbench.types import Detections, Float, UInt8
 
 __all__ = [
     "Decoding",

@@ -12,8 +12,8 @@ import numpy as np
 
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections, UInt8
 from kpbench.tags import charuco_pattern, dictionary
+from kpbench.types import Detections, UInt8
 
 __all__ = ["AprilTagDetector", "ArucoDetector", "CharucoDetector"]
 

@@ -20,7 +20,7 @@ from kpbench import match, refine, sectors
 from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
-from kpbench.keypoints import Detections, Float, UInt8
+from kpbench.types import Detections, Float, UInt8
 from kpbench.workers import one_blas_thread
 
 __all__ = ["TemplateDetector", "crossings"]

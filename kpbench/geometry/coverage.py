@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Box", "box_around", "coverage", "edge_coverage"]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from kpbench.keypoints import Float, UInt8
+from kpbench.types import Float, UInt8
 
 __all__ = [
     "Camera",

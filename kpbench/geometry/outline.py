@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kpbench.keypoints import Float
+from kpbench.types import Float
 
 __all__ = ["Arc", "Contour", "Line", "Region", "circle", "flatten", "move", "rectangle"]
 

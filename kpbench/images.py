@@ -12,7 +12,7 @@ import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files, write_atomic
-from kpbench.keypoints import UInt8
+from kpbench.types import UInt8
 
 __all__ = ["Source", "check_apart", "image_writer", "open_images"]
 
