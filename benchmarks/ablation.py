@@ -25,7 +25,7 @@ from torch import nn
 from tqdm import tqdm
 
 from kpbench import crops
-from kpbench.design import load_patches, shipped_patches
+from kpbench.patches.design import load_patches, shipped_patches
 from kpbench.recipe import Phase, Recipe, load_recipe
 from kpbench.train import train
 from kpbench.workers import cores, one_thread

@@ -14,8 +14,8 @@ import argparse
 import numpy as np
 
 import kpbench
-from kpbench.design import shipped_patches
 from kpbench.geometry.homography import projected_discs
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Limits, random_placements, stream
 from kpbench.synth import SCENE
 

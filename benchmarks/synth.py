@@ -35,8 +35,8 @@ import h5py
 import numpy as np
 
 from kpbench.background import PhotoFolder, decode_photo
-from kpbench.design import Patch, shipped_patches
 from kpbench.generation import generate
+from kpbench.patches.design import Patch, shipped_patches
 from kpbench.synth import SynthConfig
 from kpbench.types import UInt8
 

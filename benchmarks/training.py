@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kpbench.design import shipped_patches
+from kpbench.patches.design import shipped_patches
 from kpbench.recipe import Phase, load_recipe
 from kpbench.samples import load_photos, make_batch
 from kpbench.train import start, step_once, train

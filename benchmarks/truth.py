@@ -15,8 +15,8 @@ import sys
 
 import numpy as np
 
-from kpbench.design import Patch, shipped_patches
 from kpbench.geometry.homography import project
+from kpbench.patches.design import Patch, shipped_patches
 from kpbench.scene import Limits, random_placements, render_scene
 from kpbench.types import Float
 

@@ -30,8 +30,8 @@ from kpbench.cells import (
     seen_cells,
     window_weights,
 )
-from kpbench.design import Patch
 from kpbench.geometry.homography import Camera, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 
 __all__ = [

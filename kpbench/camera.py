@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from kpbench.board import CameraBoard
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import Box, box_around, coverage
 from kpbench.geometry.homography import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
 from kpbench.geometry.outline import flatten, rectangle
+from kpbench.patches.board import CameraBoard
 from kpbench.scene import Mask, Rendered, inside_image, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 

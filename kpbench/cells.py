@@ -25,8 +25,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.design import Patch
 from kpbench.geometry.coverage import box_around, coverage
+from kpbench.patches.design import Patch
 from kpbench.types import Float
 
 __all__ = ["Float32", "Grid", "attitudes", "blurred", "images", "moments", "seen_cells", "window_weights"]

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade
-from kpbench.design import Patch
 from kpbench.geometry.homography import projected_discs, resize
 from kpbench.lookalikes import draw_lookalikes
+from kpbench.patches.design import Patch
 from kpbench.scene import Limits, Placement, paint, random_poses, rasterise
 from kpbench.types import Float, UInt8
 

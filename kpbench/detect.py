@@ -59,7 +59,7 @@ class LoadedDetector:
     ----------
     name, version : str
     run : function of an image.
-    board : the board of tags that it looks for (:data:`kpbench.tags.TAG_BOARDS`), None for patches.
+    board : the board of tags that it looks for (:data:`kpbench.patches.TAG_BOARDS`), None for patches.
     identity : SHA-256 of name, version, settings and weights: what a detector's kept detections are valid for. None if
         it tells no version.
     run_many : function of several images, where that is faster than one by one, or None.

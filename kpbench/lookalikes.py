@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from kpbench.design import Patch, unit_polygons
+from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float, UInt8
 
 __all__ = ["draw_lookalikes"]

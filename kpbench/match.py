@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.design import Patch
+from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 
 __all__ = [

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.design import Patch
 from kpbench.geometry.coverage import Box, coverage
+from kpbench.patches.design import Patch
 from kpbench.types import Float
 
 __all__ = ["Fit", "fit"]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from kpbench import degrade
 from kpbench.background import PhotoFolder, decode_photo, procedural
 from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
-from kpbench.design import Patch
 from kpbench.errors import DataError
+from kpbench.patches.design import Patch
 from kpbench.scene import Limits, random_placements, render_scene
 from kpbench.types import UInt8
 from kpbench.workers import end_with_parent, one_thread

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.design import Patch, unit_polygons
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import Box, box_around, edge_coverage
 from kpbench.geometry.homography import projected_discs
+from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 __all__ = [

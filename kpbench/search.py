@@ -32,7 +32,7 @@ from kpbench.analysis import (
     pixels_needed,
 )
 from kpbench.cells import Float32, Grid
-from kpbench.design import Patch, SemiCircle
+from kpbench.patches.design import Patch, SemiCircle
 from kpbench.types import Float, UInt8
 
 __all__ = ["FAMILY_GRID", "Family", "SearchResult", "best_sets", "enumerate_family", "search"]

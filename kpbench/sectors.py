@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from kpbench.design import Patch
 from kpbench.match import (
     ANGLES,
     TURNS,
@@ -31,6 +30,7 @@ from kpbench.match import (
     short_axis,
     soft_ink,
 )
+from kpbench.patches.design import Patch
 from kpbench.types import Float
 
 __all__ = ["RING_PX", "alike", "extend", "likeness", "search"]

@@ -17,12 +17,12 @@ from pathlib import Path
 from typing import Any
 
 from kpbench import __version__
-from kpbench.board import Board
-from kpbench.design import Patch
 from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
 from kpbench.geometry.outline import Line, Region, circle, move, rectangle
+from kpbench.patches.board import Board
+from kpbench.patches.design import Patch
 from kpbench.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
 from kpbench.tiling import Tile, tiles_of
 

@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 
 from kpbench import degrade, store
 from kpbench.background import Background, PhotoFolder, procedural
-from kpbench.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
-from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry.homography import Camera
+from kpbench.patches.board import CameraBoard, find_patch, hexagon_board, keys, number
+from kpbench.patches.design import Patch, shipped_patches
+from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.scene import measure_contrast, stream
-from kpbench.tags import TAG_BOARDS, tag_board
 from kpbench.types import Float
 
 __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "board_in_view", "load_suite", "shipped_suites"]
@@ -113,7 +113,7 @@ class SuiteConfig:
     only : names of conditions; empty for all.
     backgrounds : folder of photographs, or None for procedural ones.
     distortion : OpenCV's k1, k2, p1, p2, k3; what is left out is 0.
-    board : one of :data:`kpbench.tags.TAG_BOARDS` in the place of the suite's boards of patches, or None.
+    board : one of :data:`kpbench.patches.TAG_BOARDS` in the place of the suite's boards of patches, or None.
     shard_size : images a shard; changes the files but no image.
 
     Raises

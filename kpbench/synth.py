@@ -13,9 +13,9 @@ import numpy as np
 from kpbench import degrade
 from kpbench.augment import augment
 from kpbench.background import Background, PhotoFolder, procedural
-from kpbench.design import Patch, shipped_patches
 from kpbench.errors import DataError
 from kpbench.lookalikes import draw_lookalikes
+from kpbench.patches.design import Patch, shipped_patches
 from kpbench.scene import (
     Limits,
     measure_contrast,

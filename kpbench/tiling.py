@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from kpbench.board import Board
 from kpbench.errors import DesignError
+from kpbench.patches.board import Board
 
 __all__ = ["Tile", "tiles_of"]
 

@@ -28,11 +28,11 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from kpbench import __version__
-from kpbench.design import Patch, shipped_patches
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
+from kpbench.patches.design import Patch, shipped_patches
 from kpbench.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.samples import Batch, Job, load_photos, make_batch, stream
 from kpbench.types import UInt8

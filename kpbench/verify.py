@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import match, refine
-from kpbench.design import Patch
 from kpbench.geometry.homography import suppress
 from kpbench.match import Picture
+from kpbench.patches.design import Patch
 from kpbench.runtime import Session, open_session
 from kpbench.types import Float, UInt8
 from kpbench.workers import one_blas_thread

@@ -15,9 +15,9 @@ import kpbench
 from kpbench import analysis, search
 from kpbench.cells import Grid, attitudes, images, seen_cells
 from kpbench.cli import main
-from kpbench.design import Patch, SemiCircle, unit_polygons
 from kpbench.geometry.coverage import coverage
 from kpbench.geometry.homography import Camera
+from kpbench.patches.design import Patch, SemiCircle, unit_polygons
 
 DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"
 ALTERNATIVES = kpbench.load_patches(sorted((DESIGNS / "alternatives").glob("*.toml")))

@@ -7,8 +7,8 @@ from click.testing import CliRunner
 from kpbench import match, refine
 from kpbench.augment import augment, load_augmentation
 from kpbench.cli import main
-from kpbench.design import shipped_patches
 from kpbench.errors import AugmentationError
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Limits, random_placements, render_scene
 from kpbench.store import open_dataset
 

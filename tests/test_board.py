@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.board import Board, BoardKeypoint, find_patch, grid_board, hexagon_board, load_board
-from kpbench.design import parse_patch, shipped_patches
 from kpbench.errors import DesignError
 from kpbench.geometry.homography import project
+from kpbench.patches.board import Board, BoardKeypoint, find_patch, grid_board, hexagon_board, load_board
+from kpbench.patches.design import parse_patch, shipped_patches
 
 PATCHES = shipped_patches()
 

@@ -10,11 +10,11 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.design import load_patches
 from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.generation import generate
 from kpbench.images import Source, image_writer
+from kpbench.patches.design import load_patches
 from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
 from kpbench.preview import draw_detections

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.design import shipped_patches
+from kpbench.patches.design import shipped_patches
 
 
 def run(*arguments):

@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.design import Patch, SemiCircle, load_patches, parse_patch, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
 from kpbench.geometry.coverage import box_around, coverage
+from kpbench.patches.design import Patch, SemiCircle, load_patches, parse_patch, shipped_patches, unit_polygons
 
 semicircles = st.builds(
     SemiCircle,

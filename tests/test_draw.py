@@ -227,7 +227,9 @@ def test_same_page_same_bytes(suffix):
 def test_draw_knows_no_patch():
     tree = ast.parse(Path(kpbench.draw.__file__).read_text())
     used = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert not {module for module in used if module in ("kpbench.design", "kpbench.board", "kpbench.sheet")}
+    assert not {
+        module for module in used if module in ("kpbench.patches.design", "kpbench.patches.board", "kpbench.sheet")
+    }
 
 
 @pytest.mark.skipif(not shutil.which("qpdf"), reason="needs qpdf")

@@ -7,11 +7,11 @@ import onnxruntime
 import pytest
 import torch
 
-from kpbench.design import shipped_patches
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.export import export, export_int8, fold, to_onnx
 from kpbench.network import SuperPoint
+from kpbench.patches.design import shipped_patches
 from kpbench.recipe import NetworkConfig, Phase, Recipe
 from kpbench.train import initial_weights, train
 

@@ -16,9 +16,9 @@ from click.testing import CliRunner
 from kpbench import degrade, store
 from kpbench.augment import load_augmentation
 from kpbench.cli import main
-from kpbench.design import shipped_patches
 from kpbench.errors import DataError
 from kpbench.generation import generate, generate_part, merge
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Limits, Placement, rasterise
 from kpbench.synth import SynthConfig
 from kpbench.workers import dask_executor

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kpbench import match, sectors
-from kpbench.design import shipped_patches
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Placement, render_scene
 
 PATCHES = shipped_patches()

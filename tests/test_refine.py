@@ -5,7 +5,7 @@ import pytest
 
 from kpbench import degrade, match, refine
 from kpbench.background import procedural
-from kpbench.design import shipped_patches
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Placement, render_scene
 
 PATCHES = shipped_patches()

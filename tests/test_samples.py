@@ -5,9 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpbench.crops import Disc, _paint_all, _poses
-from kpbench.design import shipped_patches
 from kpbench.errors import DataError
 from kpbench.geometry.homography import projected_disc
+from kpbench.patches.design import shipped_patches
 from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
 from kpbench.scene import Limits, Placement
 

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench.design import shipped_patches
 from kpbench.geometry.homography import project, projected_disc
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Limits, Placement, measure_contrast, random_placements, render_scene
 
 FOUR = shipped_patches()

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from kpbench.board import hexagon_board
-from kpbench.design import shipped_patches
 from kpbench.errors import DesignError
+from kpbench.patches.board import hexagon_board
+from kpbench.patches.design import shipped_patches
 from kpbench.sheet import Paper, board_sheet, patch_sheet, save_sheet
 from kpbench.sidecar import correct_sidecars, corrected
 

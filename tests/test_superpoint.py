@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
 from kpbench import verify
-from kpbench.design import parse_patch, shipped_patches
 from kpbench.detect import load_detector
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector, decode, pad_to_cells
 from kpbench.errors import DataError
+from kpbench.patches.design import parse_patch, shipped_patches
 from kpbench.runtime import open_session
 from kpbench.verify import Examined
 

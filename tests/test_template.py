@@ -5,10 +5,10 @@ import pytest
 
 from kpbench import degrade, match
 from kpbench.background import procedural
-from kpbench.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.detect import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
+from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.scene import Placement, render_scene
 
 SIZE = (320, 240)

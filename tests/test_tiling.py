@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.board import Board, BoardKeypoint, grid_board, hexagon_board
-from kpbench.design import shipped_patches
 from kpbench.errors import DesignError
+from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
+from kpbench.patches.design import shipped_patches
 from kpbench.tiling import tiles_of
 
 PATCH = shipped_patches()[0]

@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import load_file
 
 from kpbench import train as training
-from kpbench.design import shipped_patches
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.export import export
+from kpbench.patches.design import shipped_patches
 from kpbench.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
 from kpbench.samples import Batch, SampleConfig
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kpbench import verify
-from kpbench.design import shipped_patches
+from kpbench.patches.design import shipped_patches
 from kpbench.scene import Placement, render_scene
 
 PATCHES = shipped_patches()

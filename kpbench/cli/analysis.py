@@ -40,10 +40,10 @@ def analyze_patches(
     from tqdm import tqdm
 
     from kpbench import analysis, search
-    from kpbench.design import load_patches, shipped_patches
     from kpbench.design_figure import design_figure
     from kpbench.draw import WRITERS
     from kpbench.files import write_atomic
+    from kpbench.patches.design import load_patches, shipped_patches
 
     if searching and files:
         raise click.UsageError("--search goes through a whole family of designs and takes no FILES")

@@ -105,16 +105,16 @@ def _run(
 
 def _others(config: dict[str, Any]) -> bool:
     """Whether a dataset's designs are others than those that ship."""
-    from kpbench.design import shipped_patches
+    from kpbench.patches.design import shipped_patches
 
     return "patches" in config and config["patches"] != [patch.to_dict() for patch in shipped_patches()]
 
 
 def _told(name: str, patches: tuple[Path, ...], threshold: float | None) -> LoadedDetector:
     """The detector that compares images with designs, told which; it then runs in this process alone."""
-    from kpbench.design import load_patches
     from kpbench.detect import LoadedDetector
     from kpbench.detectors.template import TemplateDetector
+    from kpbench.patches.design import load_patches
 
     if name != "template":
         raise click.UsageError(f"--patches is for the template detector; {name} has designs of its own")

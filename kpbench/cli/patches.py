@@ -79,9 +79,9 @@ def render_patches(
     """
     from tqdm import tqdm
 
-    from kpbench.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
-    from kpbench.design import load_patches, shipped_patches
     from kpbench.errors import DesignError
+    from kpbench.patches.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
+    from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.sheet import board_sheet, file_stem, parse_paper, patch_sheet, save_sheet
     from kpbench.sidecar import correct_sidecars
 

@@ -49,7 +49,7 @@ def train(
       kpbench train --config configs/reference.toml --backgrounds photos/ --resume
       torchrun --nproc-per-node 4 -m kpbench train --config configs/reference.toml --workers 4
     """
-    from kpbench.design import load_patches, shipped_patches
+    from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.recipe import load_recipe
 
     recipe = load_recipe(config)

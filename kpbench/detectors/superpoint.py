@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import verify
-from kpbench.design import parse_patch
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
 from kpbench.geometry.homography import resize, suppress
+from kpbench.patches.design import parse_patch
 from kpbench.runtime import on_gpu, open_session
 from kpbench.types import Detections, Float, UInt8
 

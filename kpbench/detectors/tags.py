@@ -1,4 +1,4 @@
-"""Detectors of tags, each for its own board of :mod:`kpbench.tags`: what a patch is to be compared with.
+"""Detectors of tags, each for its own board of :mod:`kpbench.patches`: what a patch is to be compared with.
 
 Settings are the libraries' own but for those named below, which were chosen on scenes of another seed than the
 benchmark's, for the tags' good (docs/benchmark.md). Nothing is told about the board in the scene: any tag of the
@@ -12,7 +12,7 @@ import numpy as np
 
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
-from kpbench.tags import charuco_pattern, dictionary
+from kpbench.patches.tag_boards import charuco_pattern, dictionary
 from kpbench.types import Detections, UInt8
 
 __all__ = ["AprilTagDetector", "ArucoDetector", "CharucoDetector"]

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import match, refine, sectors
-from kpbench.design import Patch, shipped_patches
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
+from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, UInt8
 from kpbench.workers import one_blas_thread
 

@@ -14,11 +14,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from kpbench.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.errors import DesignError
 from kpbench.files import read_toml
 from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg
+from kpbench.patches.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.types import Float
 
 __all__ = ["Board", "BoardKeypoint", "CameraBoard", "find_patch", "grid_board", "hexagon_board", "load_board"]
@@ -44,7 +44,7 @@ class CameraKeypoint(Protocol):
 
 
 class CameraBoard(Protocol):
-    """What :mod:`kpbench.camera` needs of a board: a :class:`Board`, or a :class:`kpbench.tags.TagBoard`."""
+    """What :mod:`kpbench.camera` needs of a board: a :class:`Board`, or a :class:`kpbench.patches.TagBoard`."""
 
     @property
     def side_x_mm(self) -> float:

@@ -1,7 +1,7 @@
 """Boards of tags - ArUco, AprilTag, ChArUco - whose corners are keypoints, for the same scenes as boards of patches.
 
 Such a board is a square of black and white modules with one white module around. It has at least the six
-keypoints of :func:`kpbench.board.hexagon_board`, and its tags are as large as the board's side lets them be.
+keypoints of :func:`kpbench.patches.hexagon_board`, and its tags are as large as the board's side lets them be.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.board import HEXAGON_DIAMETER
 from kpbench.geometry.outline import circle, flatten
+from kpbench.patches.board import HEXAGON_DIAMETER
 from kpbench.types import Float
 
 __all__ = ["TAG_BOARDS", "Corner", "TagBoard", "charuco_pattern", "dictionary", "tag_board"]
@@ -67,7 +67,7 @@ class TagBoard:
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """As :meth:`kpbench.board.Board.outlines`; all ink is one part."""
+        """As :meth:`kpbench.patches.Board.outlines`; all ink is one part."""
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
         ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]

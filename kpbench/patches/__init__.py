@@ -1,0 +1,1 @@
+"""What is printed: designs of patches, boards of patches, boards of tags."""
