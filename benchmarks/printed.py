@@ -30,12 +30,12 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 import readers
 
-from kpbench.draw import Page, Shape, dxf, pdf, png, px_per_mm, svg
 from kpbench.geometry.coverage import coverage
 from kpbench.geometry.outline import Line, flatten, move
 from kpbench.patches.board import grid_board, hexagon_board
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.sheet import Paper, Sheet, board_sheet, patch_sheet
+from kpbench.printing.page import Page, Shape, dxf, pdf, png, px_per_mm, svg
+from kpbench.printing.sheet import Paper, Sheet, board_sheet, patch_sheet
 from kpbench.types import Float
 
 Image.MAX_IMAGE_PIXELS = None

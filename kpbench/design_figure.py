@@ -8,9 +8,9 @@ import numpy as np
 
 from kpbench.analysis import SIZES_PX, Analysis, DesignReport
 from kpbench.cells import SEEN_PX, Grid, images
-from kpbench.draw import Page, Shape, Text
 from kpbench.geometry.outline import Arc, circle, move, rectangle
 from kpbench.patches.design import Patch
+from kpbench.printing.page import Page, Shape, Text
 
 __all__ = ["design_figure"]
 

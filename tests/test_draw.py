@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-import kpbench.draw
-from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, dxf, mirror, pdf, png, px_per_mm, svg
+import kpbench.printing.page
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import Arc, Line, circle, move, rectangle
+from kpbench.printing.page import CUT, INK, MARKS, WRITERS, Page, Shape, Text, dxf, mirror, pdf, png, px_per_mm, svg
 
 RADIUS, AT = 15.0, (40.3, 61.7)
 HALF_DISC = ((Arc(0, 0, 1, 0, 180), Line(-1, 0, 1, 0)),)
@@ -225,10 +225,12 @@ def test_same_page_same_bytes(suffix):
 
 
 def test_draw_knows_no_patch():
-    tree = ast.parse(Path(kpbench.draw.__file__).read_text())
+    tree = ast.parse(Path(kpbench.printing.page.__file__).read_text())
     used = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
     assert not {
-        module for module in used if module in ("kpbench.patches.design", "kpbench.patches.board", "kpbench.sheet")
+        module
+        for module in used
+        if module in ("kpbench.patches.design", "kpbench.patches.board", "kpbench.printing.sheet")
     }
 
 

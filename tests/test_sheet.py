@@ -11,12 +11,12 @@ import pytest
 import readers
 from PIL import Image
 
-from kpbench.draw import CUT, INK, MARKS, WRITERS, dxf, pdf, png, svg
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import parse_patch, shipped_patches
-from kpbench.sheet import PAPERS, Paper, board_sheet, parse_paper, patch_sheet, save_sheet
+from kpbench.printing.page import CUT, INK, MARKS, WRITERS, dxf, pdf, png, svg
+from kpbench.printing.sheet import PAPERS, Paper, board_sheet, parse_paper, patch_sheet, save_sheet
 
 A4 = Paper(210, 297)
 # A rim and a quiet zone, rings, three directions of edges, and no symmetry.

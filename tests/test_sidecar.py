@@ -6,8 +6,8 @@ import pytest
 from kpbench.errors import DesignError
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.sheet import Paper, board_sheet, patch_sheet, save_sheet
-from kpbench.sidecar import correct_sidecars, corrected
+from kpbench.printing.sheet import Paper, board_sheet, patch_sheet, save_sheet
+from kpbench.printing.sidecar import correct_sidecars, corrected
 
 BOARD = board_sheet(hexagon_board(shipped_patches()[0], 350), Paper(210, 297), tile=True)
 SHEET = patch_sheet(shipped_patches(), 20, Paper(120, 80))

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from kpbench.errors import DesignError
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.tiling import tiles_of
+from kpbench.printing.tiling import tiles_of
 
 PATCH = shipped_patches()[0]
 

@@ -41,9 +41,9 @@ def analyze_patches(
 
     from kpbench import analysis, search
     from kpbench.design_figure import design_figure
-    from kpbench.draw import WRITERS
     from kpbench.files import write_atomic
     from kpbench.patches.design import load_patches, shipped_patches
+    from kpbench.printing.page import WRITERS
 
     if searching and files:
         raise click.UsageError("--search goes through a whole family of designs and takes no FILES")

@@ -82,8 +82,8 @@ def render_patches(
     from kpbench.errors import DesignError
     from kpbench.patches.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.sheet import board_sheet, file_stem, parse_paper, patch_sheet, save_sheet
-    from kpbench.sidecar import correct_sidecars
+    from kpbench.printing.sheet import board_sheet, file_stem, parse_paper, patch_sheet, save_sheet
+    from kpbench.printing.sidecar import correct_sidecars
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
     if measured is not None:

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from kpbench import __version__
-from kpbench.draw import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
 from kpbench.geometry.outline import Line, Region, circle, move, rectangle
 from kpbench.patches.board import Board
 from kpbench.patches.design import Patch
-from kpbench.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
-from kpbench.tiling import Tile, tiles_of
+from kpbench.printing.page import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
+from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
+from kpbench.printing.tiling import Tile, tiles_of
 
 __all__ = ["PAPERS", "Paper", "Sheet", "board_sheet", "parse_paper", "patch_sheet", "save_sheet"]
 
@@ -210,7 +210,7 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
     folder : path
         Made if it is not there.
     suffixes : sequence of str
-        Keys of :data:`kpbench.draw.WRITERS`.
+        Keys of :data:`kpbench.printing.WRITERS`.
     dpi : float
         Resolution of PNG.
 
