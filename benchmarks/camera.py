@@ -16,7 +16,7 @@ import argparse
 import cv2
 import numpy as np
 
-from kpbench.camera import Look, render_board
+from kpbench.render.board_view import Look, render_board
 from kpbench.suite import Shot, SuiteConfig, load_suite
 from kpbench.types import Float
 

@@ -16,7 +16,7 @@ import numpy as np
 import kpbench
 from kpbench.geometry.homography import projected_discs
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Limits, random_placements, stream
+from kpbench.render.scene import Limits, random_placements, stream
 from kpbench.synth import SCENE
 
 
@@ -24,7 +24,7 @@ def tilts_deg(H: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
     """Tilts (n, 2) about the patch's two axes, from its homography; the focal length drops out.
 
     With the principal point moved to the origin, H is radius · (rotation, perspective) of
-    :func:`kpbench.scene.random_poses`; rotating the turn away leaves ρ cos y, ρ cos x and ρ sin x sin y.
+    :func:`kpbench.render.random_poses`; rotating the turn away leaves ρ cos y, ρ cos x and ρ sin x sin y.
     """
     A = H[:, :2, :2] - np.array([(width_px - 1) / 2, (height_px - 1) / 2])[:, None] * H[:, 2:, :2]
     a = np.hypot(A[:, 0, 0], A[:, 0, 1])

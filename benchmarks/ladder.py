@@ -22,7 +22,7 @@ import numpy as np
 
 from kpbench.degrade import LADDER, apply, climb
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Placement, render_scene
+from kpbench.render.scene import Placement, render_scene
 from kpbench.suite import SuiteConfig, load_suite
 from kpbench.types import Float, UInt8
 

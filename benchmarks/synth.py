@@ -34,9 +34,9 @@ import deflate
 import h5py
 import numpy as np
 
-from kpbench.background import PhotoFolder, decode_photo
 from kpbench.generation import generate
 from kpbench.patches.design import Patch, shipped_patches
+from kpbench.render.background import PhotoFolder, decode_photo
 from kpbench.synth import SynthConfig
 from kpbench.types import UInt8
 

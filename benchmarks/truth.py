@@ -17,7 +17,7 @@ import numpy as np
 
 from kpbench.geometry.homography import project
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.types import Float
 
 SUB = 10

@@ -25,7 +25,7 @@ _HOMES = {
     "open_dataset": "store",
     "predict": "pipeline",
     "read_predictions": "predictions",
-    "render_scene": "scene",
+    "render_scene": "render.scene",
     "score": "scoring",
     "shipped_patches": "patches.design",
     "write_predictions": "predictions",

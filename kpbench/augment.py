@@ -23,7 +23,7 @@ from kpbench.degrade import albumentations
 from kpbench.errors import AugmentationError, DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project
-from kpbench.scene import Placement
+from kpbench.render.scene import Placement
 from kpbench.types import UInt8
 
 __all__ = ["augment", "load_augmentation"]

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from kpbench import degrade
 from kpbench.geometry.homography import projected_discs, resize
-from kpbench.lookalikes import draw_lookalikes
 from kpbench.patches.design import Patch
-from kpbench.scene import Limits, Placement, paint, random_poses, rasterise
+from kpbench.render.lookalikes import draw_lookalikes
+from kpbench.render.scene import Limits, Placement, paint, random_poses, rasterise
 from kpbench.types import Float, UInt8
 
 __all__ = ["MOST_KEYPOINTS", "make_crops", "no_keypoints", "window"]

@@ -20,7 +20,7 @@ import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import Box, box_around, coverage
-from kpbench.scene import Mask, inside_image
+from kpbench.render.scene import Mask, inside_image
 from kpbench.types import Float, UInt8
 
 __all__ = [

@@ -20,7 +20,7 @@ from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic
 from kpbench.images import Source, image_writer
 from kpbench.preview import draw_detections
-from kpbench.scene import stream
+from kpbench.render.scene import stream
 from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_pieces
 

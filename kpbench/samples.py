@@ -20,11 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade
-from kpbench.background import PhotoFolder, decode_photo, procedural
 from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch
-from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.render.background import PhotoFolder, decode_photo, procedural
+from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.types import UInt8
 from kpbench.workers import end_with_parent, one_thread
 
@@ -84,7 +84,7 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     Raises
     ------
     DataError
-        As :meth:`kpbench.background.PhotoFolder.open`, or if none of the part can be decoded.
+        As :meth:`kpbench.render.PhotoFolder.open`, or if none of the part can be decoded.
     """
 
     def kept(n: int, count: int) -> bool:

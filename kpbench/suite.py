@@ -18,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench import degrade, store
-from kpbench.background import Background, PhotoFolder, procedural
-from kpbench.camera import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry.homography import Camera
 from kpbench.patches.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
-from kpbench.scene import measure_contrast, stream
+from kpbench.render.background import Background, PhotoFolder, procedural
+from kpbench.render.board_view import Look, Pose, board_keypoints, pose_board, render_board
+from kpbench.render.scene import measure_contrast, stream
 from kpbench.types import Float
 
 __all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "board_in_view", "load_suite", "shipped_suites"]

@@ -12,11 +12,11 @@ import numpy as np
 
 from kpbench import degrade
 from kpbench.augment import augment
-from kpbench.background import Background, PhotoFolder, procedural
 from kpbench.errors import DataError
-from kpbench.lookalikes import draw_lookalikes
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.scene import (
+from kpbench.render.background import Background, PhotoFolder, procedural
+from kpbench.render.lookalikes import draw_lookalikes
+from kpbench.render.scene import (
     Limits,
     measure_contrast,
     random_placements,
@@ -47,7 +47,7 @@ class SynthConfig:
         the scenes are the same.
     shard_size : images a shard; changes the files but no image.
     backgrounds : folder of photographs, or None for procedural ones.
-    distractors : look-alikes an image (:mod:`kpbench.lookalikes`), up to so many; the scenes are the same.
+    distractors : look-alikes an image (:mod:`kpbench.render`), up to so many; the scenes are the same.
     augmentation : an albumentations pipeline (:func:`kpbench.augment.load_augmentation`), applied last.
     limits : what a scene may hold.
     patches : the designs to place.

@@ -9,7 +9,7 @@ from kpbench.augment import augment, load_augmentation
 from kpbench.cli import main
 from kpbench.errors import AugmentationError
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Limits, random_placements, render_scene
+from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.store import open_dataset
 
 WITH_ROOM = Limits(count=(6, 6), radius_px=(20, 50), tilt_deg=30)

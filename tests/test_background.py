@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kpbench.background import PhotoFolder, procedural
 from kpbench.errors import DataError
 from kpbench.files import image_files
+from kpbench.render.background import PhotoFolder, procedural
 
 
 def photo(width=120, height=90, seed=0):
@@ -55,7 +55,7 @@ def test_a_sample_does_not_depend_on_what_was_decoded_before(folder):
 
 
 def test_the_cache_is_bounded_and_changes_nothing(folder, monkeypatch):
-    monkeypatch.setattr("kpbench.background.CACHE_BYTES", 20_000)
+    monkeypatch.setattr("kpbench.render.background.CACHE_BYTES", 20_000)
     photos = PhotoFolder.open(folder)
     for seed in range(30):
         photos.sample(np.random.default_rng(seed), 64, 48, 3)

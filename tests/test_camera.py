@@ -5,11 +5,20 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from kpbench.camera import Look, Pose, board_keypoints, outline_px, polygon_area, pose_board, render_board, to_px
 from kpbench.errors import DataError
 from kpbench.geometry.homography import Camera, project, rotation_xyz
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
+from kpbench.render.board_view import (
+    Look,
+    Pose,
+    board_keypoints,
+    outline_px,
+    polygon_area,
+    pose_board,
+    render_board,
+    to_px,
+)
 
 BOARD = hexagon_board(shipped_patches()[0], 187.5)
 PAPER = Camera(1624, 1240, 4 / 0.0045)

@@ -3,7 +3,7 @@ import pytest
 
 from kpbench.card import facts, histograms, write_card
 from kpbench.generation import generate
-from kpbench.scene import Limits
+from kpbench.render.scene import Limits
 from kpbench.synth import SynthConfig
 
 

@@ -19,7 +19,7 @@ from kpbench.cli import main
 from kpbench.errors import DataError
 from kpbench.generation import generate, generate_part, merge
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Limits, Placement, rasterise
+from kpbench.render.scene import Limits, Placement, rasterise
 from kpbench.synth import SynthConfig
 from kpbench.workers import dask_executor
 

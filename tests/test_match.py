@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from kpbench import match, sectors
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Placement, render_scene
+from kpbench.render.scene import Placement, render_scene
 
 PATCHES = shipped_patches()
 KNOWN = match.bank(PATCHES)

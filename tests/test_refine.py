@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kpbench import degrade, match, refine
-from kpbench.background import procedural
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Placement, render_scene
+from kpbench.render.background import procedural
+from kpbench.render.scene import Placement, render_scene
 
 PATCHES = shipped_patches()
 

@@ -8,8 +8,8 @@ from kpbench.crops import Disc, _paint_all, _poses
 from kpbench.errors import DataError
 from kpbench.geometry.homography import projected_disc
 from kpbench.patches.design import shipped_patches
+from kpbench.render.scene import Limits, Placement
 from kpbench.samples import Job, SampleConfig, load_photos, make_batch, stream
-from kpbench.scene import Limits, Placement
 
 PATCHES = shipped_patches()
 CROPS = SampleConfig(size=(96, 96))

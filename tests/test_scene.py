@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from kpbench.geometry.homography import project, projected_disc
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Limits, Placement, measure_contrast, random_placements, render_scene
+from kpbench.render.scene import Limits, Placement, measure_contrast, random_placements, render_scene
 
 FOUR = shipped_patches()
 

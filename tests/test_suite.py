@@ -10,10 +10,10 @@ from click.testing import CliRunner
 
 import kpbench.suite
 from kpbench import degrade, store
-from kpbench.background import procedural
 from kpbench.cli import main
 from kpbench.errors import DataError
 from kpbench.generation import generate
+from kpbench.render.background import procedural
 from kpbench.suite import SuiteConfig, load_suite, shipped_suites
 
 SMALL = (203, 155)

@@ -2,12 +2,12 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench.camera import Look, board_keypoints, pose_board, render_board
 from kpbench.detect import load_detector
 from kpbench.geometry.homography import Camera
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
+from kpbench.render.board_view import Look, board_keypoints, pose_board, render_board
 from kpbench.suite import SuiteConfig, load_suite
 
 CAMERA = Camera(640, 480, 350.3)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from kpbench import degrade, match
-from kpbench.background import procedural
 from kpbench.detect import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
-from kpbench.scene import Placement, render_scene
+from kpbench.render.background import procedural
+from kpbench.render.scene import Placement, render_scene
 
 SIZE = (320, 240)
 # x, y, radius, tilt (short over long semi-axis), two turns: one patch of each design

@@ -5,7 +5,7 @@ import pytest
 
 from kpbench import verify
 from kpbench.patches.design import shipped_patches
-from kpbench.scene import Placement, render_scene
+from kpbench.render.scene import Placement, render_scene
 
 PATCHES = shipped_patches()
 SURE = 0.9

@@ -23,8 +23,8 @@ from kpbench.analysis import (
     pixels_needed,
     sample_windows,
 )
-from kpbench.background import procedural
 from kpbench.cells import Grid, attitudes
+from kpbench.render.background import procedural
 
 HERE = Path(__file__).parent
 

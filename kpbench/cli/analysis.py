@@ -76,7 +76,7 @@ def _windows(backgrounds: Path | None) -> UInt8:
     import numpy as np
 
     from kpbench.analysis import sample_windows
-    from kpbench.background import PhotoFolder, procedural
+    from kpbench.render.background import PhotoFolder, procedural
 
     rng = np.random.default_rng(0)
 

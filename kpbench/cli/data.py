@@ -84,7 +84,7 @@ def synth(
     from kpbench.augment import load_augmentation
     from kpbench.cli.progress import write_dataset
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.scene import Limits
+    from kpbench.render.scene import Limits
     from kpbench.synth import SynthConfig
 
     config = SynthConfig(

@@ -44,7 +44,7 @@ class CameraKeypoint(Protocol):
 
 
 class CameraBoard(Protocol):
-    """What :mod:`kpbench.camera` needs of a board: a :class:`Board`, or a :class:`kpbench.patches.TagBoard`."""
+    """What :mod:`kpbench.render` needs of a board: a :class:`Board`, or a :class:`kpbench.patches.TagBoard`."""
 
     @property
     def side_x_mm(self) -> float:

@@ -20,7 +20,7 @@ from kpbench.geometry.coverage import Box, box_around, coverage
 from kpbench.geometry.homography import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
 from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import CameraBoard
-from kpbench.scene import Mask, Rendered, inside_image, measure_contrast
+from kpbench.render.scene import Mask, Rendered, inside_image, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 __all__ = ["Look", "Pose", "board_keypoints", "outline_px", "polygon_area", "pose_board", "render_board"]

@@ -1,0 +1,1 @@
+"""Patches before a background: a clean image and its truth."""
