@@ -20,7 +20,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from kpbench.degrade import LADDER, apply, climb
+from kpbench.degrade.effects import LADDER, apply, climb
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Placement, render_scene
 from kpbench.suite import SuiteConfig, load_suite

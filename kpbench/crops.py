@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import degrade
+from kpbench.degrade import effects as degrade
 from kpbench.geometry.homography import projected_discs, resize
 from kpbench.patches.design import Patch
 from kpbench.render.lookalikes import draw_lookalikes

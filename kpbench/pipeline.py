@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import degrade, store
+from kpbench import store
+from kpbench.degrade import effects as degrade
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic

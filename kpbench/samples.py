@@ -19,8 +19,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import degrade
 from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
+from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch
 from kpbench.render.background import PhotoFolder, decode_photo, procedural

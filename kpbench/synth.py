@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from kpbench import degrade
 from kpbench.augment import augment
+from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.render.background import Background, PhotoFolder, procedural

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench import degrade
-from kpbench.degrade import blur, box_taps, dimming, line_kernel, motion_blur, noise, paper_mix, rain, shadow
+from kpbench.degrade import effects as degrade
+from kpbench.degrade.effects import blur, box_taps, dimming, line_kernel, motion_blur, noise, paper_mix, rain, shadow
 
 
 def picture(channels=1):

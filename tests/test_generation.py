@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kpbench import degrade, store
+from kpbench import store
 from kpbench.augment import load_augmentation
 from kpbench.cli import main
+from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.generation import generate, generate_part, merge
 from kpbench.patches.design import shipped_patches

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench import degrade
-from kpbench.degrade import LADDER, apply, climb
+from kpbench.degrade import effects as degrade
+from kpbench.degrade.effects import LADDER, apply, climb
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import coverage
 

@@ -3,7 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpbench import degrade, match, refine
+from kpbench import match, refine
+from kpbench.degrade import effects as degrade
 from kpbench.patches.design import shipped_patches
 from kpbench.render.background import procedural
 from kpbench.render.scene import Placement, render_scene

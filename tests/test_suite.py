@@ -9,8 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 import kpbench.suite
-from kpbench import degrade, store
+from kpbench import store
 from kpbench.cli import main
+from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.generation import generate
 from kpbench.render.background import procedural

@@ -3,7 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench import degrade, match
+from kpbench import match
+from kpbench.degrade import effects as degrade
 from kpbench.detect import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
