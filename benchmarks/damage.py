@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import kpbench
+from kpbench.dataset.generation import generate
 from kpbench.errors import DataError
-from kpbench.generation import generate
 from kpbench.synth import SynthConfig
 
 

@@ -24,9 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
+from kpbench.dataset.generation import generate
+from kpbench.dataset.shard import open_dataset, sha256_of
 from kpbench.errors import DataError
-from kpbench.generation import generate
-from kpbench.store import open_dataset, sha256_of
 from kpbench.synth import SynthConfig
 
 CONFIG = SynthConfig(n=48, size_px=(320, 240), shard_size=4)

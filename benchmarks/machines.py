@@ -18,7 +18,7 @@ from pathlib import Path
 
 import distributed
 
-from kpbench.generation import generate, generate_part, merge
+from kpbench.dataset.generation import generate, generate_part, merge
 from kpbench.synth import SynthConfig
 from kpbench.workers import dask_executor
 

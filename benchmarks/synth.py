@@ -34,7 +34,7 @@ import deflate
 import h5py
 import numpy as np
 
-from kpbench.generation import generate
+from kpbench.dataset.generation import generate
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.render.background import PhotoFolder, decode_photo
 from kpbench.synth import SynthConfig

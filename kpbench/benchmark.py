@@ -19,11 +19,12 @@ from typing import Any
 
 import numpy as np
 
-from kpbench import __version__, store
+from kpbench import __version__
+from kpbench.dataset import shard as store
+from kpbench.dataset.generation import generate
 from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.files import check_own
-from kpbench.generation import generate
 from kpbench.patches.design import shipped_patches
 from kpbench.pipeline import detect_some
 from kpbench.predictions import Predictions, read_predictions, write_predictions

@@ -14,13 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import store
+from kpbench.dataset import shard as store
+from kpbench.dataset.drawing import draw_detections
 from kpbench.degrade import effects as degrade
 from kpbench.detect import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic
 from kpbench.images import Source, image_writer
-from kpbench.preview import draw_detections
 from kpbench.render.scene import stream
 from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_pieces

@@ -45,8 +45,8 @@ from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdo
 
 if TYPE_CHECKING:
     from kpbench.coco import CocoDataset
+    from kpbench.dataset.shard import Dataset
     from kpbench.gallery import Case
-    from kpbench.store import Dataset
 
 __all__ = [
     "Report",
@@ -274,7 +274,7 @@ def provenance(
     from importlib.metadata import version
 
     from kpbench import __version__
-    from kpbench.store import sha256_of
+    from kpbench.dataset.shard import sha256_of
 
     return {
         "kpbench": __version__,

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import store
+from kpbench.dataset import shard as store
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder

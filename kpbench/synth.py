@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from kpbench.augment import augment
+from kpbench.dataset.shard import Sample
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch, shipped_patches
@@ -26,7 +27,6 @@ from kpbench.render.scene import (
     stream,
     tabulate,
 )
-from kpbench.store import Sample
 
 __all__ = ["SynthConfig"]
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from kpbench.card import facts, histograms, write_card
-from kpbench.generation import generate
+from kpbench.dataset.card import facts, histograms, write_card
+from kpbench.dataset.generation import generate
 from kpbench.render.scene import Limits
 from kpbench.synth import SynthConfig
 

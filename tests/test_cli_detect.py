@@ -10,14 +10,14 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
+from kpbench.dataset.drawing import draw_detections
+from kpbench.dataset.generation import generate
 from kpbench.detect import LoadedDetector, load_detector
 from kpbench.errors import DataError
-from kpbench.generation import generate
 from kpbench.images import Source, image_writer
 from kpbench.patches.design import load_patches
 from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
-from kpbench.preview import draw_detections
 from kpbench.render.scene import Limits
 from kpbench.synth import SynthConfig
 from kpbench.types import Detections

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
+from kpbench.dataset.export import export_dataset
+from kpbench.dataset.shard import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_manifest
 from kpbench.files import write_atomic
-from kpbench.interchange import export_dataset
 from kpbench.metrics import COUNTS, METRICS
 from kpbench.predictions import Predictions, write_predictions
-from kpbench.store import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_manifest
 from kpbench.types import KEYPOINT_DTYPE, Detections
 
 

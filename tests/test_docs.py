@@ -19,7 +19,7 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.generation import generate
+from kpbench.dataset.generation import generate
 from kpbench.synth import SynthConfig
 
 ROOT = Path(__file__).parent.parent

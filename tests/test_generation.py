@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kpbench import store
 from kpbench.augment import load_augmentation
 from kpbench.cli import main
+from kpbench.dataset import shard as store
+from kpbench.dataset.generation import generate, generate_part, merge
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
-from kpbench.generation import generate, generate_part, merge
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, rasterise
 from kpbench.synth import SynthConfig

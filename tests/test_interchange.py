@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench import interchange
+from kpbench.dataset import export as interchange
+from kpbench.dataset.export import export_dataset
+from kpbench.dataset.generation import generate
 from kpbench.errors import DataError
-from kpbench.generation import generate
-from kpbench.interchange import export_dataset
 from kpbench.synth import SynthConfig
 
 

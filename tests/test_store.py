@@ -7,10 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench import store
-from kpbench.errors import DataError
-from kpbench.files import write_atomic
-from kpbench.store import (
+from kpbench.dataset import shard as store
+from kpbench.dataset.shard import (
     Sample,
     ShardEntry,
     encode_shard,
@@ -19,6 +17,8 @@ from kpbench.store import (
     sha256_of,
     write_manifest,
 )
+from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.types import KEYPOINT_DTYPE
 
 CONFIG = {"seed": 3, "kind": "test"}

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 import kpbench.suite
-from kpbench import store
 from kpbench.cli import main
+from kpbench.dataset import shard as store
+from kpbench.dataset.generation import generate
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
-from kpbench.generation import generate
 from kpbench.render.background import procedural
 from kpbench.suite import SuiteConfig, load_suite, shipped_suites
 

@@ -118,7 +118,7 @@ def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
       kpbench merge train
     """
     from kpbench.cli.progress import tell_dataset
-    from kpbench.generation import merge as merged
+    from kpbench.dataset.generation import merge as merged
 
     tell_dataset(merged(dataset, parts))
 
@@ -132,8 +132,8 @@ def inspect(dataset: Path) -> None:
     Example:
       kpbench inspect kpbench-data
     """
-    from kpbench.card import facts, histograms
-    from kpbench.store import open_dataset
+    from kpbench.dataset.card import facts, histograms
+    from kpbench.dataset.shard import open_dataset
 
     data = open_dataset(dataset)
     click.echo(f"{'dataset':12} {data.path}")
@@ -156,7 +156,7 @@ def verify(dataset: Path) -> None:
       kpbench verify kpbench-data
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.store import open_dataset
+    from kpbench.dataset.shard import open_dataset
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "verify") as progress:
@@ -182,9 +182,9 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     """
     import cv2
 
-    from kpbench.card import overview
+    from kpbench.dataset.card import overview
+    from kpbench.dataset.shard import open_dataset
     from kpbench.files import write_atomic
-    from kpbench.store import open_dataset
 
     data = open_dataset(dataset)
     sheet = overview(data, count, columns, tile_width)
@@ -205,8 +205,8 @@ def export(dataset: Path, form: str, out: Path | None) -> None:
       kpbench export kpbench-data --format coco
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.interchange import export_dataset
-    from kpbench.store import open_dataset
+    from kpbench.dataset.export import export_dataset
+    from kpbench.dataset.shard import open_dataset
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "export") as progress:

@@ -84,9 +84,9 @@ def _run(
 ) -> Predicted:
     """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
+    from kpbench.dataset.shard import open_dataset
     from kpbench.images import open_images
     from kpbench.pipeline import predict, predict_images
-    from kpbench.store import open_dataset
 
     if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):
         images = open_images(source, but=overlay)

@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
-from kpbench.generation import Recipe, generate, generate_part
-from kpbench.store import Dataset
+from kpbench.dataset.generation import Recipe, generate, generate_part
+from kpbench.dataset.shard import Dataset
 from kpbench.workers import Progress, dask_executor
 
 __all__ = ["progress_bar", "tell_dataset", "write_dataset"]

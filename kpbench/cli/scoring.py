@@ -14,10 +14,10 @@ from kpbench.cli.options import Finite
 if TYPE_CHECKING:
     from kpbench.coco import CocoDataset
     from kpbench.comparison import Comparison
+    from kpbench.dataset.shard import Dataset
     from kpbench.pose import PoseGroup
     from kpbench.predictions import Predictions
     from kpbench.scoring import Scores
-    from kpbench.store import Dataset
     from kpbench.tables import Table
 
 __all__ = ["compare", "score"]
@@ -249,8 +249,8 @@ def _write_report(
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset | CocoDataset:
     """--gt, else the dataset that the file names, else ./kpbench-data."""
     from kpbench.coco import open_coco
+    from kpbench.dataset.shard import open_dataset
     from kpbench.errors import PredictionsError
-    from kpbench.store import open_dataset
 
     if gt:
         return open_coco(gt) if gt.suffix.lower() == ".json" and gt.name != "dataset.json" else open_dataset(gt)

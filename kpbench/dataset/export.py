@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.card import names, write_card
+from kpbench.dataset.card import names, write_card
+from kpbench.dataset.shard import Dataset
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.store import Dataset
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 __all__ = ["FORMATS", "export_dataset"]

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from kpbench.dataset.drawing import contact_sheet, draw_keypoints
+from kpbench.dataset.shard import Dataset
 from kpbench.files import write_atomic
-from kpbench.preview import contact_sheet, draw_keypoints
-from kpbench.store import Dataset
 from kpbench.types import Float, UInt8
 
 __all__ = ["FILES", "Histogram", "facts", "histograms", "names", "overview", "write_card"]

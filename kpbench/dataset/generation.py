@@ -22,7 +22,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Protocol
 
-from kpbench import card, store
+from kpbench.dataset import card
+from kpbench.dataset import shard as store
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.workers import Progress, run_pieces
