@@ -20,7 +20,7 @@ import numpy as np
 import kpbench
 from kpbench.dataset.generation import generate
 from kpbench.errors import DataError
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 
 
 def read(folder: Path) -> bytes:

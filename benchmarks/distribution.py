@@ -17,7 +17,7 @@ import kpbench
 from kpbench.geometry.homography import projected_discs
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, random_placements, stream
-from kpbench.synth import SCENE
+from kpbench.synth.synthetic import SCENE
 
 
 def tilts_deg(H: np.ndarray, width_px: int, height_px: int) -> np.ndarray:

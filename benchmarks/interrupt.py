@@ -27,7 +27,7 @@ import numpy as np
 from kpbench.dataset.generation import generate
 from kpbench.dataset.shard import open_dataset, sha256_of
 from kpbench.errors import DataError
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 
 CONFIG = SynthConfig(n=48, size_px=(320, 240), shard_size=4)
 WORDS = ["synth", "--n", "48", "--size", "320x240", "--shard-size", "4", "--workers", "2"]

@@ -23,7 +23,7 @@ import numpy as np
 from kpbench.degrade.effects import LADDER, apply, climb
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Placement, render_scene
-from kpbench.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig, load_suite
 from kpbench.types import Float, UInt8
 
 SIDE, RADIUS, BLACK, WHITE = 256, 45.0, 50, 200

@@ -19,7 +19,7 @@ from pathlib import Path
 import distributed
 
 from kpbench.dataset.generation import generate, generate_part, merge
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 from kpbench.workers import dask_executor
 
 

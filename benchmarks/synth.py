@@ -37,7 +37,7 @@ import numpy as np
 from kpbench.dataset.generation import generate
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.render.background import PhotoFolder, decode_photo
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 from kpbench.types import UInt8
 
 WIDTH, HEIGHT = 640, 480

@@ -29,7 +29,7 @@ from kpbench.patches.design import shipped_patches
 from kpbench.pipeline import detect_some
 from kpbench.predictions import Predictions, read_predictions, write_predictions
 from kpbench.scoring import Scores, score
-from kpbench.suite import SuiteConfig
+from kpbench.synth.suite import SuiteConfig
 from kpbench.workers import Progress, run_pieces
 
 __all__ = ["Benched", "bench", "images_to_do"]

@@ -5,12 +5,12 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench import match, refine
-from kpbench.augment import augment, load_augmentation
 from kpbench.cli import main
 from kpbench.dataset.shard import open_dataset
 from kpbench.errors import AugmentationError
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, random_placements, render_scene
+from kpbench.synth.user_pipeline import augment, load_augmentation
 
 WITH_ROOM = Limits(count=(6, 6), radius_px=(20, 50), tilt_deg=30)
 

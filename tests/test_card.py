@@ -4,7 +4,7 @@ import pytest
 from kpbench.dataset.card import facts, histograms, write_card
 from kpbench.dataset.generation import generate
 from kpbench.render.scene import Limits
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from kpbench.patches.design import load_patches
 from kpbench.pipeline import predict_images
 from kpbench.predictions import read_predictions
 from kpbench.render.scene import Limits
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 from kpbench.types import Detections
 
 MODULE = """

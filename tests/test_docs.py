@@ -20,7 +20,7 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.dataset.generation import generate
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kpbench.augment import load_augmentation
 from kpbench.cli import main
 from kpbench.dataset import shard as store
 from kpbench.dataset.generation import generate, generate_part, merge
@@ -21,7 +20,8 @@ from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, rasterise
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
+from kpbench.synth.user_pipeline import load_augmentation
 from kpbench.workers import dask_executor
 
 

@@ -10,7 +10,7 @@ from kpbench.dataset import export as interchange
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.generation import generate
 from kpbench.errors import DataError
-from kpbench.synth import SynthConfig
+from kpbench.synth.synthetic import SynthConfig
 
 
 @pytest.fixture(scope="module")

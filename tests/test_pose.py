@@ -12,7 +12,7 @@ from kpbench.geometry.homography import Camera
 from kpbench.pose import PoseErrors, pose_errors, pose_groups
 from kpbench.report import scores_file
 from kpbench.scoring import score
-from kpbench.suite import SuiteConfig, board_in_view, load_suite
+from kpbench.synth.suite import SuiteConfig, board_in_view, load_suite
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 CAMERA = Camera(640, 480, 500.0, (0.02, -0.01, 0.0, 0.0, 0.0))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from kpbench.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig, load_suite
 
 ROOT = Path(__file__).parent.parent
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-import kpbench.suite
+import kpbench.synth.suite
 from kpbench.cli import main
 from kpbench.dataset import shard as store
 from kpbench.dataset.generation import generate
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.render.background import procedural
-from kpbench.suite import SuiteConfig, load_suite, shipped_suites
+from kpbench.synth.suite import SuiteConfig, load_suite, shipped_suites
 
 SMALL = (203, 155)
 
@@ -313,7 +313,7 @@ def test_the_help_names_every_effect():
 
 def test_a_background_is_made_once_though_every_rung_shows_it(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(kpbench.suite, "procedural", lambda *a: made.append(a) or procedural(*a))
+    monkeypatch.setattr(kpbench.synth.suite, "procedural", lambda *a: made.append(a) or procedural(*a))
     config = SuiteConfig(load_suite("paper-v1"), images=6, size_px=(64, 64), only=("blur",), shard_size=3)
     assert len(generate(config, tmp_path / "a", workers=1).dataset) == 6 * 4 * 4
     assert len(made) == 6

@@ -201,7 +201,7 @@ def test_a_missing_file_is_named(tmp_path):
 def test_the_shipped_weights_find_large_clean_patches(name):
     """An easy scene, in which a wrong file, frame or channel order is seen."""
     from kpbench.render.scene import Limits
-    from kpbench.synth import SynthConfig
+    from kpbench.synth.synthetic import SynthConfig
 
     detect = load_detector(name)
     limits = Limits(count=(4, 4), radius_px=(15, 30), tilt_deg=20, black=(0, 30), white=(220, 255))

@@ -67,7 +67,7 @@ def bench(
     from kpbench.benchmark import bench as run_bench
     from kpbench.benchmark import images_to_do
     from kpbench.cli.progress import progress_bar
-    from kpbench.suite import SuiteConfig, load_suite
+    from kpbench.synth.suite import SuiteConfig, load_suite
 
     if quick and (images or size):
         raise click.UsageError("--quick sets --images and --size; drop one of them")

@@ -81,11 +81,11 @@ def synth(
       kpbench synth --n 500 --deteriorate none --augment pipeline.json --out augmented
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
-    from kpbench.augment import load_augmentation
     from kpbench.cli.progress import write_dataset
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.render.scene import Limits
-    from kpbench.synth import SynthConfig
+    from kpbench.synth.synthetic import SynthConfig
+    from kpbench.synth.user_pipeline import load_augmentation
 
     config = SynthConfig(
         n=n,

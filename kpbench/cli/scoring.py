@@ -216,7 +216,7 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
 def _poses(scores: Scores, dataset: Dataset | CocoDataset) -> tuple[PoseGroup, ...]:
     from kpbench.errors import DataError
     from kpbench.pose import pose_errors, pose_groups
-    from kpbench.suite import board_in_view
+    from kpbench.synth.suite import board_in_view
 
     view = board_in_view(dataset.config)
     if view is None:

@@ -61,7 +61,7 @@ def suite(
       kpbench suite paper-v1 --board aruco
     """
     from kpbench.cli.progress import write_dataset
-    from kpbench.suite import SuiteConfig, load_suite
+    from kpbench.synth.suite import SuiteConfig, load_suite
 
     config = SuiteConfig(load_suite(name), images, seed, size, only, backgrounds, distortion or (), board)
     write_dataset(config, out or Path("kpbench-suite") / config.name, "suite", **run)

@@ -96,7 +96,7 @@ def generate(
     Parameters
     ----------
     config : Recipe
-        :class:`kpbench.synth.SynthConfig` or :class:`kpbench.suite.SuiteConfig`.
+        :class:`kpbench.synth.SynthConfig` or :class:`kpbench.synth.SuiteConfig`.
     out : folder, made if it is not there; or a URL that fsspec reaches, such as ``s3://bucket/name``.
     workers : processes; None for one a core. 1 works in this process.
     executor : where the shards are made instead, see :func:`kpbench.workers.run_pieces`; what runs there has to see

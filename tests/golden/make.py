@@ -19,8 +19,8 @@ import numpy as np
 
 import kpbench
 from kpbench.detect import DETECTORS
-from kpbench.suite import SuiteConfig, load_suite
-from kpbench.synth import SynthConfig
+from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.synthetic import SynthConfig
 
 HERE = Path(__file__).parent
 SIZE, TAGS_SIZE = (320, 240), (640, 480)

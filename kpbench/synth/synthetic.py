@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from kpbench.augment import augment
 from kpbench.dataset.shard import Sample
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
@@ -27,6 +26,7 @@ from kpbench.render.scene import (
     stream,
     tabulate,
 )
+from kpbench.synth.user_pipeline import augment
 
 __all__ = ["SynthConfig"]
 
@@ -48,7 +48,7 @@ class SynthConfig:
     shard_size : images a shard; changes the files but no image.
     backgrounds : folder of photographs, or None for procedural ones.
     distractors : look-alikes an image (:mod:`kpbench.render`), up to so many; the scenes are the same.
-    augmentation : an albumentations pipeline (:func:`kpbench.augment.load_augmentation`), applied last.
+    augmentation : an albumentations pipeline (:func:`kpbench.synth.load_augmentation`), applied last.
     limits : what a scene may hold.
     patches : the designs to place.
 

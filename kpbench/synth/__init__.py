@@ -1,0 +1,1 @@
+"""What a synthetic set or a suite is a function of."""
