@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 import kpbench
-from kpbench import analysis, search
-from kpbench.cells import Grid, attitudes, images, seen_cells
+from kpbench.analysis import measures as analysis
+from kpbench.analysis import search
+from kpbench.analysis.cell_images import Grid, attitudes, images, seen_cells
 from kpbench.cli import main
 from kpbench.geometry.coverage import coverage
 from kpbench.geometry.homography import Camera

@@ -12,8 +12,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from kpbench import search, shipped_patches
-from kpbench.analysis import (
+from kpbench import shipped_patches
+from kpbench.analysis import search
+from kpbench.analysis.cell_images import Grid, attitudes
+from kpbench.analysis.measures import (
     SIZES_PX,
     basin,
     bound,
@@ -23,7 +25,6 @@ from kpbench.analysis import (
     pixels_needed,
     sample_windows,
 )
-from kpbench.cells import Grid, attitudes
 from kpbench.render.background import procedural
 
 HERE = Path(__file__).parent

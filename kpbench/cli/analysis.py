@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import click
 
 if TYPE_CHECKING:
-    from kpbench.analysis import Analysis
-    from kpbench.search import SearchResult
+    from kpbench.analysis.measures import Analysis
+    from kpbench.analysis.search import SearchResult
     from kpbench.types import UInt8
 
 __all__ = ["analyze_patches"]
@@ -39,8 +39,9 @@ def analyze_patches(
     """
     from tqdm import tqdm
 
-    from kpbench import analysis, search
-    from kpbench.design_figure import design_figure
+    from kpbench.analysis import measures as analysis
+    from kpbench.analysis import search
+    from kpbench.analysis.figure import design_figure
     from kpbench.files import write_atomic
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.printing.page import WRITERS
@@ -75,7 +76,7 @@ def analyze_patches(
 def _windows(backgrounds: Path | None) -> UInt8:
     import numpy as np
 
-    from kpbench.analysis import sample_windows
+    from kpbench.analysis.measures import sample_windows
     from kpbench.render.background import PhotoFolder, procedural
 
     rng = np.random.default_rng(0)
@@ -94,7 +95,7 @@ def _windows(backgrounds: Path | None) -> UInt8:
 
 
 def _table(analysis: Analysis) -> str:
-    from kpbench.analysis import SIZES_PX
+    from kpbench.analysis.measures import SIZES_PX
 
     lines = ["Bound of the centre in px, worst direction (noise 10, contrast 180 grey levels); frontal, then 60° tilt:"]
     head = [f"{r:g} px" for r in SIZES_PX] + [f"{r:g} px" for r in SIZES_PX] + ["5 px, no rim"]

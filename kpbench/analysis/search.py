@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.analysis import (
+from kpbench.analysis.cell_images import Float32, Grid
+from kpbench.analysis.measures import (
     PAIR_STEPS,
     SIZES_PX,
     basin,
@@ -31,7 +32,6 @@ from kpbench.analysis import (
     natural_response,
     pixels_needed,
 )
-from kpbench.cells import Float32, Grid
 from kpbench.patches.design import Patch, SemiCircle
 from kpbench.types import Float, UInt8
 

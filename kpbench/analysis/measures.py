@@ -1,7 +1,7 @@
 """How good a design is: localisation, look-alikes among designs and in nature, pixels needed.
 
 Distances are root mean squares in units of the ink contrast: 0.1 at a contrast of 180 grey levels is a
-difference of 18 grey levels a pixel, which is what noise has to hide. See :mod:`kpbench.cells` for how
+difference of 18 grey levels a pixel, which is what noise has to hide. See :mod:`kpbench.analysis` for how
 designs are rendered, blurred and seen.
 """
 
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from kpbench.cells import (
+from kpbench.analysis.cell_images import (
     BLUR,
     DIRECTIONS_DEG,
     HALF,

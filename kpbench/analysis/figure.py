@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kpbench.analysis import SIZES_PX, Analysis, DesignReport
-from kpbench.cells import SEEN_PX, Grid, images
+from kpbench.analysis.cell_images import SEEN_PX, Grid, images
+from kpbench.analysis.measures import SIZES_PX, Analysis, DesignReport
 from kpbench.geometry.outline import Arc, circle, move, rectangle
 from kpbench.patches.design import Patch
 from kpbench.printing.page import Page, Shape, Text

@@ -1,0 +1,1 @@
+"""How good a design is, the search for better ones, and its figure."""
