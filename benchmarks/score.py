@@ -24,8 +24,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kpbench.coco import open_coco
-from kpbench.predictions import Predictions, read_predictions, write_predictions
+from kpbench.predictions.coco import open_coco
+from kpbench.predictions.files import Predictions, read_predictions, write_predictions
 from kpbench.scoring import evaluate, summarise
 from kpbench.tally import Settings, tally
 from kpbench.types import KEYPOINT_DTYPE, Truth

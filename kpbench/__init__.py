@@ -16,7 +16,7 @@ _HOMES = {
     "KEYPOINT_DTYPE": "types",
     "KpbenchError": "errors",
     "Patch": "patches.design",
-    "Predictions": "predictions",
+    "Predictions": "predictions.files",
     "Truth": "types",
     "compare": "comparison",
     "generate": "dataset.generation",
@@ -24,11 +24,11 @@ _HOMES = {
     "load_patches": "patches.design",
     "open_dataset": "dataset.shard",
     "predict": "pipeline",
-    "read_predictions": "predictions",
+    "read_predictions": "predictions.files",
     "render_scene": "render.scene",
     "score": "scoring",
     "shipped_patches": "patches.design",
-    "write_predictions": "predictions",
+    "write_predictions": "predictions.files",
 }
 
 __all__ = ["__version__", *sorted(_HOMES)]

@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 
 from kpbench.errors import DataError
-from kpbench.predictions import read_predictions
+from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
 
 __all__ = ["run_program"]

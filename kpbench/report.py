@@ -44,9 +44,9 @@ from kpbench.scoring import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
 if TYPE_CHECKING:
-    from kpbench.coco import CocoDataset
     from kpbench.dataset.shard import Dataset
     from kpbench.gallery import Case
+    from kpbench.predictions.coco import CocoDataset
 
 __all__ = [
     "Report",

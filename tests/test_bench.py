@@ -13,7 +13,7 @@ from kpbench.benchmark import bench, images_to_do
 from kpbench.cli import main
 from kpbench.detect import load_detector
 from kpbench.errors import DataError
-from kpbench.predictions import read_predictions
+from kpbench.predictions.files import read_predictions
 from kpbench.synth.suite import SuiteConfig, load_suite
 
 SMALL = SuiteConfig(load_suite("paper-v1"), images=2, size_px=(203, 155), only=("blur",), shard_size=10)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from kpbench.assignment import match
-from kpbench.predictions import Predictions
+from kpbench.predictions.files import Predictions
 from kpbench.scoring import evaluate
 from kpbench.tally import Settings
 from kpbench.types import KEYPOINT_DTYPE, Truth

@@ -10,9 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench import pieces, records
 from kpbench.errors import DataError, PredictionsError
-from kpbench.predictions import Predictions, read_predictions, write_predictions
+from kpbench.predictions import decode as pieces
+from kpbench.predictions import json_files as records
+from kpbench.predictions.files import Predictions, read_predictions, write_predictions
 from kpbench.types import Detections
 
 FORMATS = ["json", "jsonl", "csv", "parquet", "h5"]

@@ -13,7 +13,7 @@ from kpbench import assignment, bootstrap
 from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
 from kpbench.errors import DataError, GateFailed, PredictionsError
 from kpbench.metrics import METRICS
-from kpbench.predictions import Predictions
+from kpbench.predictions.files import Predictions
 from kpbench.scoring import check_gates, evaluate, score
 from kpbench.tally import Settings
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth

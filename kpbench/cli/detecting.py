@@ -60,7 +60,7 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
     from kpbench.images import check_apart
-    from kpbench.predictions import check_target, write_predictions
+    from kpbench.predictions.files import check_target, write_predictions
 
     check_target(out)
     if overlay is not None:

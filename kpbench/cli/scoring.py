@@ -12,11 +12,11 @@ import click
 from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
-    from kpbench.coco import CocoDataset
     from kpbench.comparison import Comparison
     from kpbench.dataset.shard import Dataset
     from kpbench.pose import PoseGroup
-    from kpbench.predictions import Predictions
+    from kpbench.predictions.coco import CocoDataset
+    from kpbench.predictions.files import Predictions
     from kpbench.scoring import Scores
     from kpbench.tables import Table
 
@@ -195,7 +195,7 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
     from dataclasses import replace
 
     from kpbench.errors import PredictionsError
-    from kpbench.predictions import read_predictions
+    from kpbench.predictions.files import read_predictions
     from kpbench.scoring import score as score_all
 
     predictions = [read_predictions(path) for path in files]
@@ -248,9 +248,9 @@ def _write_report(
 
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset | CocoDataset:
     """--gt, else the dataset that the file names, else ./kpbench-data."""
-    from kpbench.coco import open_coco
     from kpbench.dataset.shard import open_dataset
     from kpbench.errors import PredictionsError
+    from kpbench.predictions.coco import open_coco
 
     if gt:
         return open_coco(gt) if gt.suffix.lower() == ".json" and gt.name != "dataset.json" else open_dataset(gt)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from kpbench.errors import PredictionsError
-from kpbench.pieces import kind
+from kpbench.predictions.decode import kind
 from kpbench.types import Predictions
 
 __all__ = ["SCHEMA", "header_of", "read_header"]

@@ -10,10 +10,10 @@ from typing import Annotated, Any, BinaryIO, NamedTuple
 import msgspec
 import numpy as np
 
-from kpbench.coco import coco_results
 from kpbench.errors import PredictionsError
-from kpbench.header import SCHEMA, header_of, read_header
-from kpbench.pieces import PIECE_BYTES, cut, kind, parse, records, typed
+from kpbench.predictions.coco import coco_results
+from kpbench.predictions.decode import PIECE_BYTES, cut, kind, parse, records, typed
+from kpbench.predictions.header import SCHEMA, header_of, read_header
 from kpbench.types import Float, Int, Misfit, Predictions, offsets_of
 
 __all__ = ["read_json", "read_jsonl", "write_json", "write_jsonl"]

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import PredictionsError
-from kpbench.header import header_of, read_header
-from kpbench.pieces import parse, short
+from kpbench.predictions.decode import parse, short
+from kpbench.predictions.header import header_of, read_header
 from kpbench.types import Predictions, offsets_of
 
 __all__ = ["COLUMNS", "from_table", "read_csv", "read_h5", "read_parquet", "write_csv", "write_h5", "write_parquet"]

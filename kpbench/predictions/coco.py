@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.columns import from_table
 from kpbench.errors import DataError, PredictionsError
-from kpbench.pieces import cut, kind, parse, records, typed, without_gc
+from kpbench.predictions.decode import cut, kind, parse, records, typed, without_gc
+from kpbench.predictions.table_files import from_table
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 __all__ = ["CocoDataset", "coco_results", "open_coco"]

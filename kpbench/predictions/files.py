@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from kpbench import columns, records
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import write_atomic
-from kpbench.pieces import without_gc
+from kpbench.predictions import json_files as records
+from kpbench.predictions import table_files as columns
+from kpbench.predictions.decode import without_gc
 from kpbench.types import Predictions
 
 __all__ = ["Predictions", "check_target", "read_predictions", "write_predictions"]

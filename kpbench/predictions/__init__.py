@@ -1,0 +1,1 @@
+"""Predictions files in and out."""
