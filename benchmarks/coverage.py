@@ -13,8 +13,8 @@ import argparse
 
 import numpy as np
 
-from kpbench.bootstrap import intervals
-from kpbench.metrics import SUMS, ratios
+from kpbench.scoring.bootstrap import intervals
+from kpbench.scoring.metrics import SUMS, ratios
 
 IMAGES, KEYPOINTS = 8, 6  # of a scene; of an image
 REGIMES = {"good": (18.0, 2.0), "middling": (3.0, 2.0), "poor": (1.0, 4.0)}  # Beta distribution of the quality

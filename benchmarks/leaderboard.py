@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.charts import COLOURS, STYLE, Series, line_chart
-from kpbench.metrics import LABELS
 from kpbench.paper import PAPER
+from kpbench.scoring.metrics import LABELS
 from kpbench.tables import Cell, Estimate, Table, to_markdown
 
 ROOT = Path(__file__).parent.parent

@@ -26,8 +26,8 @@ import numpy as np
 
 from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import Predictions, read_predictions, write_predictions
-from kpbench.scoring import evaluate, summarise
-from kpbench.tally import Settings, tally
+from kpbench.scoring.outcomes import Settings, tally
+from kpbench.scoring.scores import evaluate, summarise
 from kpbench.types import KEYPOINT_DTYPE, Truth
 
 KEYPOINTS, CONDITIONS, RUNGS = 5, 5, 4

@@ -18,7 +18,7 @@ _HOMES = {
     "Patch": "patches.design",
     "Predictions": "predictions.files",
     "Truth": "types",
-    "compare": "comparison",
+    "compare": "scoring.comparison",
     "generate": "dataset.generation",
     "load_detector": "detect",
     "load_patches": "patches.design",
@@ -26,7 +26,7 @@ _HOMES = {
     "predict": "pipeline",
     "read_predictions": "predictions.files",
     "render_scene": "render.scene",
-    "score": "scoring",
+    "score": "scoring.scores",
     "shipped_patches": "patches.design",
     "write_predictions": "predictions.files",
 }

@@ -28,7 +28,7 @@ from kpbench.files import check_own
 from kpbench.patches.design import shipped_patches
 from kpbench.pipeline import detect_some
 from kpbench.predictions.files import Predictions, read_predictions, write_predictions
-from kpbench.scoring import Scores, score
+from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.workers import Progress, run_pieces
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS
-from kpbench.metrics import SUMS
-from kpbench.tally import Tally
+from kpbench.scoring.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS
+from kpbench.scoring.metrics import SUMS
+from kpbench.scoring.outcomes import Tally
 from kpbench.types import UInt8
 
 __all__ = ["Case", "Mark", "worst_cases"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kpbench.metrics import PAPER_METRICS
+from kpbench.scoring.metrics import PAPER_METRICS
 
 __all__ = ["PAPER", "PaperTable", "paper_value"]
 

@@ -16,9 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from kpbench.breakpoints import breakpoints
 from kpbench.charts import STYLE
-from kpbench.comparison import Comparison
 from kpbench.errors import DataError
 from kpbench.exhibits import (
     Figure,
@@ -39,8 +37,10 @@ from kpbench.exhibits import (
     verdict_table,
 )
 from kpbench.paper import PAPER, SYNTHETIC, SYNTHETIC_PX
-from kpbench.pose import PoseGroup
-from kpbench.scoring import Scores
+from kpbench.scoring.board_pose import PoseGroup
+from kpbench.scoring.breakpoints import breakpoints
+from kpbench.scoring.comparison import Comparison
+from kpbench.scoring.scores import Scores
 from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
 if TYPE_CHECKING:

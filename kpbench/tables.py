@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from kpbench.bootstrap import Interval
+from kpbench.scoring.bootstrap import Interval
 
 __all__ = ["WRITERS", "Cell", "Estimate", "Table", "cell_text", "to_csv", "to_latex", "to_markdown", "to_plain"]
 

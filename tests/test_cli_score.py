@@ -12,8 +12,8 @@ from kpbench.cli import main
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.shard import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_manifest
 from kpbench.files import write_atomic
-from kpbench.metrics import COUNTS, METRICS
 from kpbench.predictions.files import Predictions, write_predictions
+from kpbench.scoring.metrics import COUNTS, METRICS
 from kpbench.types import KEYPOINT_DTYPE, Detections
 
 

@@ -7,10 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from kpbench.assignment import match
 from kpbench.predictions.files import Predictions
-from kpbench.scoring import evaluate
-from kpbench.tally import Settings
+from kpbench.scoring.assignment import match
+from kpbench.scoring.outcomes import Settings
+from kpbench.scoring.scores import evaluate
 from kpbench.types import KEYPOINT_DTYPE, Truth
 
 CASES = 1000

@@ -9,9 +9,9 @@ import pytest
 from kpbench.errors import DataError
 from kpbench.exhibits import pose_table
 from kpbench.geometry.homography import Camera
-from kpbench.pose import PoseErrors, pose_errors, pose_groups
 from kpbench.report import scores_file
-from kpbench.scoring import score
+from kpbench.scoring.board_pose import PoseErrors, pose_errors, pose_groups
+from kpbench.scoring.scores import score
 from kpbench.synth.suite import SuiteConfig, board_in_view, load_suite
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 

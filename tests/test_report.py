@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from kpbench import exhibits
-from kpbench.breakpoints import breakpoints
 from kpbench.charts import Series, bar_chart, line_chart, standalone
 from kpbench.errors import DataError
 from kpbench.gallery import worst_cases
 from kpbench.paper import PAPER, SYNTHETIC, paper_value
 from kpbench.report import Report, scores_csv, scores_file, to_html, to_latex_report, to_markdown_report, write_report
-from kpbench.scoring import score
+from kpbench.scoring.breakpoints import breakpoints
+from kpbench.scoring.scores import score
 from kpbench.tables import Estimate, Table, to_csv, to_latex, to_markdown, to_plain
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 

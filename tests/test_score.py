@@ -9,13 +9,13 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from kpbench import assignment, bootstrap
-from kpbench.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
 from kpbench.errors import DataError, GateFailed, PredictionsError
-from kpbench.metrics import METRICS
 from kpbench.predictions.files import Predictions
-from kpbench.scoring import check_gates, evaluate, score
-from kpbench.tally import Settings
+from kpbench.scoring import assignment, bootstrap
+from kpbench.scoring.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, match
+from kpbench.scoring.metrics import METRICS
+from kpbench.scoring.outcomes import Settings
+from kpbench.scoring.scores import check_gates, evaluate, score
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 
@@ -724,7 +724,7 @@ def test_the_flat_table_and_the_file_hold_the_same_numbers():
 
 
 def test_the_evaluator_needs_neither_generator_nor_files():
-    code = "import sys, kpbench.scoring; print(*sorted(m for m in sys.modules))"
+    code = "import sys, kpbench.scoring.scores; print(*sorted(m for m in sys.modules))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     heavy = {"h5py", "torch", "onnxruntime", "cv2", "pandas", "pyarrow"}
     ours = {f"kpbench.{name}" for name in ("design", "scene", "degrade", "store", "pipeline", "detect")}

@@ -12,12 +12,12 @@ import click
 from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
-    from kpbench.comparison import Comparison
     from kpbench.dataset.shard import Dataset
-    from kpbench.pose import PoseGroup
     from kpbench.predictions.coco import CocoDataset
     from kpbench.predictions.files import Predictions
-    from kpbench.scoring import Scores
+    from kpbench.scoring.board_pose import PoseGroup
+    from kpbench.scoring.comparison import Comparison
+    from kpbench.scoring.scores import Scores
     from kpbench.tables import Table
 
 __all__ = ["compare", "score"]
@@ -29,7 +29,7 @@ class Limit(click.ParamType[tuple[str, float]]):
     name = "METRIC=VALUE"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        from kpbench.metrics import METRICS
+        from kpbench.scoring.metrics import METRICS
 
         if isinstance(value, tuple):
             return value
@@ -111,7 +111,7 @@ def score(
     from kpbench.exhibits import pose_table
     from kpbench.files import check_targets, write_atomic
     from kpbench.report import provenance, scores_csv, scores_file
-    from kpbench.scoring import check_gates
+    from kpbench.scoring.scores import check_gates
     from kpbench.tables import to_plain
 
     _check_report(report_file)
@@ -158,11 +158,11 @@ def compare(
       kpbench compare new.json old.json --fail-on-regression
       kpbench compare a.json b.json c.json --report compared.html
     """
-    from kpbench.comparison import check_regression
-    from kpbench.comparison import compare as compare_scores
     from kpbench.exhibits import difference_table, verdict_table
     from kpbench.files import check_targets, write_atomic
     from kpbench.report import comparison_file, provenance
+    from kpbench.scoring.comparison import check_regression
+    from kpbench.scoring.comparison import compare as compare_scores
     from kpbench.tables import to_plain
 
     if len(files) < 2:
@@ -196,7 +196,7 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
 
     from kpbench.errors import PredictionsError
     from kpbench.predictions.files import read_predictions
-    from kpbench.scoring import score as score_all
+    from kpbench.scoring.scores import score as score_all
 
     predictions = [read_predictions(path) for path in files]
     dataset = _dataset_of(predictions[0], files[0], gt)
@@ -215,7 +215,7 @@ def _scored(files: Sequence[Path], gt: Path | None, how: dict[str, Any]) -> tupl
 
 def _poses(scores: Scores, dataset: Dataset | CocoDataset) -> tuple[PoseGroup, ...]:
     from kpbench.errors import DataError
-    from kpbench.pose import pose_errors, pose_groups
+    from kpbench.scoring.board_pose import pose_errors, pose_groups
     from kpbench.synth.suite import board_in_view
 
     view = board_in_view(dataset.config)
@@ -274,7 +274,7 @@ def _is_fingerprint(text: str) -> bool:
 def _summary(scores: Scores) -> str:
     """What the terminal shows."""
     from kpbench.exhibits import group_table
-    from kpbench.metrics import LABELS, PAPER_METRICS
+    from kpbench.scoring.metrics import LABELS, PAPER_METRICS
     from kpbench.tables import Estimate, Table, cell_text, to_plain
 
     overall, settings = scores.overall, scores.settings

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import DataError, GateFailed
-from kpbench.metrics import LABELS, PAPER_METRICS, SUMS, ratios
-from kpbench.scoring import Scores
+from kpbench.scoring.bootstrap import Interval, by_scene, intervals
+from kpbench.scoring.metrics import LABELS, PAPER_METRICS, SUMS, ratios
+from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
 __all__ = ["Comparison", "Difference", "check_regression", "compare"]

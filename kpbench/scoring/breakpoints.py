@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.bootstrap import Interval, by_scene, intervals
-from kpbench.metrics import SUMS
-from kpbench.scoring import Scores
+from kpbench.scoring.bootstrap import Interval, by_scene, intervals
+from kpbench.scoring.metrics import SUMS
+from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
 __all__ = ["LIMIT", "Breakpoint", "breakpoints"]

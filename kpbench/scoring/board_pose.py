@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.geometry.homography import Camera
-from kpbench.scoring import Scores
-from kpbench.tally import Tally
+from kpbench.scoring.outcomes import Tally
+from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
 __all__ = ["PoseErrors", "PoseGroup", "pose_errors", "pose_groups"]

@@ -102,7 +102,7 @@ LABELS = {
 def ratios(sums: NDArray[Any], matching: str) -> dict[str, Float]:
     """The metrics of :data:`RATIOS` from sums of shape (..., 9), each of shape (...); nan where undefined.
 
-    ``matching`` is that of :class:`kpbench.tally.Settings`.
+    ``matching`` is that of :class:`kpbench.scoring.Settings`.
     """
     images, truths, detections, matched, id_correct, literal, id_literal = np.moveaxis(sums, -1, 0)[:7].astype(float)
 

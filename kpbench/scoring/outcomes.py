@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.assignment import DUPLICATE, NEAR_MISS, Matches, match
 from kpbench.errors import DataError, PredictionsError
+from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, Matches, match
 from kpbench.types import Float, Predictions, Truth
 
 __all__ = ["Settings", "Tally", "tally"]
@@ -86,13 +86,13 @@ class Tally:
     score : ndarray of shape (D,), float64
     patch_id : ndarray of shape (D,), int64, or None
     kind : ndarray of shape (D,), uint8
-        See :class:`kpbench.assignment.Matches`.
+        See :class:`kpbench.scoring.Matches`.
     nearest : ndarray of shape (D,), int64
         The nearest true keypoint in reach, or -1.
     literally_correct : ndarray of shape (D,), bool
         It has the identity of that one.
     contradicted : ndarray of shape (T,), bool
-        See :class:`kpbench.assignment.Matches`.
+        See :class:`kpbench.scoring.Matches`.
     settings : Settings
     detector : dict
     """
@@ -122,11 +122,11 @@ class Tally:
 
     @cached_property
     def image_sums(self) -> Int:
-        """(N, 9) counts of each image in the order of :data:`kpbench.metrics.SUMS`."""
+        """(N, 9) counts of each image in the order of :data:`kpbench.scoring.SUMS`."""
         return self.sums(self.truth_image, self.image, len(self.truth))
 
     def sums(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
-        """(rows, 9) counts in the order of :data:`kpbench.metrics.SUMS`; what is in row -1 is left out."""
+        """(rows, 9) counts in the order of :data:`kpbench.scoring.SUMS`; what is in row -1 is left out."""
 
         def count(row: Int) -> Int:
             return np.bincount(row[row >= 0], minlength=rows)

@@ -3,7 +3,7 @@
 Conventions
 -----------
 A detection reaches a true keypoint if their distance is **at most** ε, a fraction of the radius of *that*
-keypoint's projected circle (:class:`kpbench.tally.Settings`). One detection explains one keypoint only: of all
+keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection explains one keypoint only: of all
 one-to-one assignments the one with most matches is taken, among those the one with the highest scores, then the one
 with the smallest distances, then the one lower in (x, y). Identities never decide who is matched, and the
 order of images, keypoints and detections changes nothing.
@@ -23,11 +23,11 @@ from typing import Any, Literal, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.assignment import MATCHED, matched_within
-from kpbench.bootstrap import Interval, by_scene, intervals
 from kpbench.errors import GateFailed, PredictionsError
-from kpbench.metrics import COUNTS, METRICS, SUMS, error_metrics, precision_recall, ratios
-from kpbench.tally import Settings, Tally, tally
+from kpbench.scoring.assignment import MATCHED, matched_within
+from kpbench.scoring.bootstrap import Interval, by_scene, intervals
+from kpbench.scoring.metrics import COUNTS, METRICS, SUMS, error_metrics, precision_recall, ratios
+from kpbench.scoring.outcomes import Settings, Tally, tally
 from kpbench.types import Detections, Predictions, Truth
 
 __all__ = ["Group", "Scores", "check_gates", "evaluate", "score", "summarise"]
@@ -61,10 +61,10 @@ class Group:
     key : Key
         ``condition``, ``rung``, ``patch_id`` and ``radius_px`` of the group, each also an attribute of its own.
     metrics : dict of str to float or None
-        The names of :data:`kpbench.metrics.METRICS`; None where a metric is undefined (0/0) or the group does not
+        The names of :data:`kpbench.scoring.METRICS`; None where a metric is undefined (0/0) or the group does not
         have it.
     counts : dict of str to int or None
-        The names of :data:`kpbench.metrics.COUNTS`; None as above.
+        The names of :data:`kpbench.scoring.COUNTS`; None as above.
     intervals : dict of str to (low, high) or None
         95 % bootstrap intervals of the metrics that are ratios of counts.
     """
@@ -365,7 +365,7 @@ def score(
     truth : Truth or Dataset
     detections : Predictions, or one Detections for each image of the truth, in its order
     eps, eps_radius, matching, resamples, seed
-        See :class:`kpbench.tally.Settings`.
+        See :class:`kpbench.scoring.Settings`.
     allow_missing : bool
         Take an image without prediction as one without detections, instead of refusing it.
 

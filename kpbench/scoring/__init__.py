@@ -1,0 +1,1 @@
+"""Truth and detections become numbers; nothing here reads a file."""
