@@ -17,10 +17,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from kpbench.charts import COLOURS, STYLE, Series, line_chart
-from kpbench.paper import PAPER
+from kpbench.report.charts import COLOURS, STYLE, Series, line_chart
+from kpbench.report.paper import PAPER
+from kpbench.report.tables import Cell, Estimate, Table, to_markdown
 from kpbench.scoring.metrics import LABELS
-from kpbench.tables import Cell, Estimate, Table, to_markdown
 
 ROOT = Path(__file__).parent.parent
 RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"

@@ -9,7 +9,7 @@ from test_cli_score import write_dataset
 from kpbench.cli import main
 from kpbench.errors import DataError, GateFailed
 from kpbench.predictions.files import Predictions, write_predictions
-from kpbench.report import Report, to_html, to_markdown_report
+from kpbench.report.report import Report, to_html, to_markdown_report
 from kpbench.scoring.comparison import METRICS, check_regression, compare
 from kpbench.scoring.scores import score
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError
-from kpbench.exhibits import pose_table
 from kpbench.geometry.homography import Camera
-from kpbench.report import scores_file
+from kpbench.report.figures import pose_table
+from kpbench.report.report import scores_file
 from kpbench.scoring.board_pose import PoseErrors, pose_errors, pose_groups
 from kpbench.scoring.scores import score
 from kpbench.synth.suite import SuiteConfig, board_in_view, load_suite

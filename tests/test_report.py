@@ -12,15 +12,23 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from kpbench import exhibits
-from kpbench.charts import Series, bar_chart, line_chart, standalone
 from kpbench.errors import DataError
-from kpbench.gallery import worst_cases
-from kpbench.paper import PAPER, SYNTHETIC, paper_value
-from kpbench.report import Report, scores_csv, scores_file, to_html, to_latex_report, to_markdown_report, write_report
+from kpbench.report import figures as exhibits
+from kpbench.report.charts import Series, bar_chart, line_chart, standalone
+from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
+from kpbench.report.report import (
+    Report,
+    scores_csv,
+    scores_file,
+    to_html,
+    to_latex_report,
+    to_markdown_report,
+    write_report,
+)
+from kpbench.report.tables import Estimate, Table, to_csv, to_latex, to_markdown, to_plain
+from kpbench.report.worst_cases import worst_cases
 from kpbench.scoring.breakpoints import breakpoints
 from kpbench.scoring.scores import score
-from kpbench.tables import Estimate, Table, to_csv, to_latex, to_markdown, to_plain
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 SHARE = {3: 1.0, 7: 0.95, 11: 0.5, 15: 0.25}  # of keypoints found at each rung

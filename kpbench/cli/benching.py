@@ -94,11 +94,11 @@ def bench(
 
 def _report(out: Path, suite: str, runs: list[Benched]) -> None:
     """Print the tables of one suite, and write its report and scores."""
-    from kpbench.exhibits import breakpoint_table, overview_table, paper_table
     from kpbench.files import write_atomic
-    from kpbench.paper import PAPER
-    from kpbench.report import Report, provenance, scores_file, write_report
-    from kpbench.tables import to_markdown
+    from kpbench.report.figures import breakpoint_table, overview_table, paper_table
+    from kpbench.report.paper import PAPER
+    from kpbench.report.report import Report, provenance, scores_file, write_report
+    from kpbench.report.tables import to_markdown
 
     scores = tuple(run.scores for run in runs)
     known = provenance(runs[0].dataset, [run.predictions for run in runs], ["kpbench", *sys.argv[1:]])

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from kpbench.dataset.shard import Dataset
     from kpbench.predictions.coco import CocoDataset
     from kpbench.predictions.files import Predictions
+    from kpbench.report.tables import Table
     from kpbench.scoring.board_pose import PoseGroup
     from kpbench.scoring.comparison import Comparison
     from kpbench.scoring.scores import Scores
-    from kpbench.tables import Table
 
 __all__ = ["compare", "score"]
 
@@ -108,11 +108,11 @@ def score(
       kpbench score preds.json --report report.html
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
     """
-    from kpbench.exhibits import pose_table
     from kpbench.files import check_targets, write_atomic
-    from kpbench.report import provenance, scores_csv, scores_file
+    from kpbench.report.figures import pose_table
+    from kpbench.report.report import provenance, scores_csv, scores_file
+    from kpbench.report.tables import to_plain
     from kpbench.scoring.scores import check_gates
-    from kpbench.tables import to_plain
 
     _check_report(report_file)
     check_targets((report_file, json_file, csv_file), [preds])
@@ -158,12 +158,12 @@ def compare(
       kpbench compare new.json old.json --fail-on-regression
       kpbench compare a.json b.json c.json --report compared.html
     """
-    from kpbench.exhibits import difference_table, verdict_table
     from kpbench.files import check_targets, write_atomic
-    from kpbench.report import comparison_file, provenance
+    from kpbench.report.figures import difference_table, verdict_table
+    from kpbench.report.report import comparison_file, provenance
+    from kpbench.report.tables import to_plain
     from kpbench.scoring.comparison import check_regression
     from kpbench.scoring.comparison import compare as compare_scores
-    from kpbench.tables import to_plain
 
     if len(files) < 2:
         raise click.UsageError("expected two or more predictions files")
@@ -184,7 +184,7 @@ def compare(
 
 
 def _check_report(path: Path | None) -> None:
-    from kpbench.report import WRITERS
+    from kpbench.report.report import WRITERS
 
     if path and path.suffix.lower() not in WRITERS:
         raise click.UsageError(f"--report {path}: expected a file ending in {', '.join(WRITERS)}")
@@ -233,8 +233,8 @@ def _write_report(
     poses: Sequence[Table] = (),
 ) -> None:
     from kpbench.errors import DataError
-    from kpbench.gallery import Case, worst_cases
-    from kpbench.report import Report, write_report
+    from kpbench.report.report import Report, write_report
+    from kpbench.report.worst_cases import Case, worst_cases
 
     cases: tuple[tuple[Case, ...], ...] = ()
     if path.suffix.lower() == ".html":
@@ -273,9 +273,9 @@ def _is_fingerprint(text: str) -> bool:
 
 def _summary(scores: Scores) -> str:
     """What the terminal shows."""
-    from kpbench.exhibits import group_table
+    from kpbench.report.figures import group_table
+    from kpbench.report.tables import Estimate, Table, cell_text, to_plain
     from kpbench.scoring.metrics import LABELS, PAPER_METRICS
-    from kpbench.tables import Estimate, Table, cell_text, to_plain
 
     overall, settings = scores.overall, scores.settings
     # What the paper's formulas give as printed is shown wherever it differs

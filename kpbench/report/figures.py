@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 
-from kpbench.charts import Series, bar_chart, line_chart
-from kpbench.paper import PAPER, SYNTHETIC, PaperTable, paper_value
+from kpbench.report.charts import Series, bar_chart, line_chart
+from kpbench.report.paper import PAPER, SYNTHETIC, PaperTable, paper_value
+from kpbench.report.tables import Cell, Estimate, Table
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import LIMIT, Breakpoint, breakpoints
 from kpbench.scoring.comparison import METRICS as COMPARED
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Group, Scores
-from kpbench.tables import Cell, Estimate, Table
 
 __all__ = [
     "Figure",

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from kpbench.charts import STYLE
 from kpbench.errors import DataError
-from kpbench.exhibits import (
+from kpbench.report.charts import STYLE
+from kpbench.report.figures import (
     Figure,
     breakpoint_table,
     condition_table,
@@ -36,17 +36,17 @@ from kpbench.exhibits import (
     taxonomy_charts,
     verdict_table,
 )
-from kpbench.paper import PAPER, SYNTHETIC, SYNTHETIC_PX
+from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_PX
+from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import breakpoints
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
-from kpbench.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 
 if TYPE_CHECKING:
     from kpbench.dataset.shard import Dataset
-    from kpbench.gallery import Case
     from kpbench.predictions.coco import CocoDataset
+    from kpbench.report.worst_cases import Case
 
 __all__ = [
     "Report",
@@ -83,7 +83,7 @@ class Report:
     comparisons : tuple of Comparison
         Of the first run with others; may be empty.
     poses : tuple of Table
-        Of :func:`kpbench.exhibits.pose_table`; may be empty.
+        Of :func:`kpbench.report.pose_table`; may be empty.
     title : str
     """
 
