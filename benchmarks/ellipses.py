@@ -28,9 +28,9 @@ from torch import nn
 from tqdm import tqdm
 
 import kpbench
-from kpbench import match
 from kpbench.detect import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector
+from kpbench.fitting import templates as match
 from kpbench.workers import cores, one_thread
 
 NEAR, FAR = 0.6, 1.0

@@ -35,7 +35,7 @@ import kpbench
 from kpbench import verify
 from kpbench.detect import suppress, to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
-from kpbench.match import VIEW_PX, Picture, bank, short_axis
+from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0

@@ -2,8 +2,8 @@
 
 A network says where it sees a keypoint and which design it takes it for. Here a small network looks at the
 surroundings of each such place and says which ellipse the patch fills, if there is one (:func:`ellipses`). The likely
-designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.match`), what may be a patch is fitted
-to the pixels (:func:`fitted`, with :mod:`kpbench.refine`), and after each of the two a judge, a small network too, sees
+designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.fitting`), what may be a patch is fitted
+to the pixels (:func:`fitted`, with :mod:`kpbench.fitting`), and after each of the two a judge, a small network too, sees
 the place in the frame of the patch, beside the design, and what was measured. It gives the log odds that there is a
 patch of this design at this place, and how far the pose is off; the first one looks twice, the second time in the pose
 that it took for right (:func:`again`). The second one knows what the first one says, and what other patches the image
@@ -24,9 +24,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import match, refine
+from kpbench.fitting import design_fit as refine
+from kpbench.fitting import templates as match
+from kpbench.fitting.templates import Picture
 from kpbench.geometry.homography import suppress
-from kpbench.match import Picture
 from kpbench.patches.design import Patch
 from kpbench.runtime import Session, open_session
 from kpbench.types import Float, UInt8
@@ -119,7 +120,7 @@ class Hypotheses:
     at : (n, 2) px, that place.
     which : (n,) index of the design.
     xy, A : (n, 2) px, (n, 2, 2) patch frame to px.
-    view : (n, VIEW_PX²) from :func:`kpbench.match.view`, nan outside the image.
+    view : (n, VIEW_PX²) from :func:`kpbench.fitting.view`, nan outside the image.
     blur_px : (n,) standard deviation by the fit, 0 before it.
     evidence : (n, len(POSED)) or (n, len(FITTED))
     """

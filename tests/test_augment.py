@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from kpbench import match, refine
 from kpbench.cli import main
 from kpbench.dataset.shard import open_dataset
 from kpbench.errors import AugmentationError
+from kpbench.fitting import design_fit as refine
+from kpbench.fitting import templates as match
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.synth.user_pipeline import augment, load_augmentation

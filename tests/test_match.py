@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench import match, sectors
+from kpbench.fitting import sector_search as sectors
+from kpbench.fitting import templates as match
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Placement, render_scene
 

@@ -3,8 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpbench import match, refine
 from kpbench.degrade import effects as degrade
+from kpbench.fitting import design_fit as refine
+from kpbench.fitting import templates as match
 from kpbench.patches.design import shipped_patches
 from kpbench.render.background import procedural
 from kpbench.render.scene import Placement, render_scene

@@ -3,11 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench import match
 from kpbench.degrade import effects as degrade
 from kpbench.detect import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
+from kpbench.fitting import templates as match
 from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.render.background import procedural
 from kpbench.render.scene import Placement, render_scene

@@ -4,8 +4,8 @@ Edges that meet at a point point at it, under any perspective. So the first stag
 asks of every pixel whether the gradients around it are square to the direction to it, and are of more than
 one direction (a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
 location of distinct points*, 1987). That needs no templates. The few hundred places that remain are
-compared with the designs (:mod:`kpbench.sectors`, :mod:`kpbench.match`), coarse to fine, each stage on
-what the one before kept, and what is left is fitted (:mod:`kpbench.refine`).
+compared with the designs (:mod:`kpbench.fitting`, :mod:`kpbench.fitting`), coarse to fine, each stage on
+what the one before kept, and what is left is fitted (:mod:`kpbench.fitting`).
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import match, refine, sectors
 from kpbench.detect import to_grey
 from kpbench.errors import DataError
+from kpbench.fitting import design_fit as refine
+from kpbench.fitting import sector_search as sectors
+from kpbench.fitting import templates as match
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, UInt8
 from kpbench.workers import one_blas_thread

@@ -7,7 +7,7 @@ Each step looks at many candidates at once:
   *Lucas-Kanade 20 years on*, IJCV 2004), by the whole design or by its innermost sectors;
 * :func:`view` shows the image in the frame of the patch.
 
-Where not even the ellipse is known :mod:`kpbench.sectors` finds it.
+Where not even the ellipse is known :mod:`kpbench.fitting` finds it.
 Poses are affine: ``x_px = xy + A @ u``.
 """
 

@@ -1,7 +1,7 @@
 """Poses of patches from a rough place and scale alone, by their innermost sectors, which look the same at every size.
 
 :func:`search` samples the image on circles around the place, under a bank of tilts, and correlates with the sectors
-of every design in every rotation; :func:`kpbench.match.align` moves what it finds onto the image; :func:`extend`
+of every design in every rotation; :func:`kpbench.fitting.align` moves what it finds onto the image; :func:`extend`
 measures how far the sectors reach, which is the patch's size.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from kpbench.match import (
+from kpbench.fitting.templates import (
     ANGLES,
     TURNS,
     Bank,
@@ -61,7 +61,7 @@ def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margi
 
     Parameters
     ----------
-    levels : from :func:`kpbench.match.pyramid`.
+    levels : from :func:`kpbench.fitting.pyramid`.
     xy : (N, 2) px.
     level : (N,) pyramid level to look at; the circle has a short semi-axis of ``3 · 2^level`` px.
     known : the designs.

@@ -2,7 +2,7 @@
 
 :func:`fit` renders the design with exact coverage under the pose, blurs it, and moves everything that it
 does not know until model and pixels agree (Gauss-Newton with robust weights). What it does not know:
-centre, affine map, perspective, both inks, and the blur. :mod:`kpbench.match` finds the pose that it starts from.
+centre, affine map, perspective, both inks, and the blur. :mod:`kpbench.fitting` finds the pose that it starts from.
 """
 
 from __future__ import annotations
@@ -194,7 +194,7 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
 
 
 def _short_axis(m: Float) -> float:
-    """:func:`kpbench.match.short_axis` of one map."""
+    """:func:`kpbench.fitting.short_axis` of one map."""
     (a, b), (c, d) = m.tolist()
     square, det = a * a + b * b + c * c + d * d, a * d - b * c
     return float(np.sqrt(max(square - np.sqrt(max(square**2 - 4 * det**2, 0.0)), 1e-12) / 2))

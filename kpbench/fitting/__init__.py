@@ -1,0 +1,1 @@
+"""The pose of a design, found on pixels."""
