@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 import kpbench
-from kpbench.detect import to_grey
+from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
 from kpbench.geometry.homography import resize
 from kpbench.network import SuperPoint

@@ -1,4 +1,4 @@
-"""Train the network of :func:`kpbench.verify.ellipses` on synthetic sets, and show what it gives on another set.
+"""Train the network of :func:`kpbench.detectors.ellipses` on synthetic sets, and show what it gives on another set.
 
     python benchmarks/ellipses.py DATASET ... --test DATASET [--go-on] [--write]
 
@@ -28,7 +28,7 @@ from torch import nn
 from tqdm import tqdm
 
 import kpbench
-from kpbench.detect import to_grey
+from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.fitting import templates as match
 from kpbench.workers import cores, one_thread
@@ -42,7 +42,7 @@ USUAL = 2.5
 
 
 class Ellipse(nn.Module):
-    """Surroundings (n, 4, 32, 32), grey levels, to log odds and what :func:`kpbench.verify.moved` takes."""
+    """Surroundings (n, 4, 32, 32), grey levels, to log odds and what :func:`kpbench.detectors.moved` takes."""
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()

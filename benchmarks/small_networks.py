@@ -1,4 +1,4 @@
-"""The small networks of :mod:`kpbench.verify`: what `ellipses.py` and `verification.py` share."""
+"""The small networks of :mod:`kpbench.detectors`: what `ellipses.py` and `verification.py` share."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from onnx.numpy_helper import to_array
 from torch import nn
 from tqdm import tqdm
 
-from kpbench import verify
+from kpbench.detectors import verification as verify
 from kpbench.export import quantise
 from kpbench.network import unfold
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 import kpbench
-from kpbench import verify
+from kpbench.detectors import verification as verify
 from kpbench.detectors.superpoint import (
     CANDIDATE,
     Decoding,

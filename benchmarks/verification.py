@@ -1,4 +1,4 @@
-"""Train the judges of :mod:`kpbench.verify` on synthetic sets, and show what they give on another set.
+"""Train the judges of :mod:`kpbench.detectors` on synthetic sets, and show what they give on another set.
 
     python benchmarks/verification.py DATASET ... --test DATASET [--model FILE.onnx] [--go-on] [--write]
 
@@ -32,14 +32,14 @@ from torch import nn
 from tqdm import tqdm
 
 import kpbench
-from kpbench import verify
-from kpbench.detect import suppress, to_grey
+from kpbench.detectors import verification as verify
+from kpbench.detectors.interface import suppress, to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
 from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0
-"""Log odds by which more hypotheses than in :func:`kpbench.verify.examine` are looked at again and fitted, to train."""
+"""Log odds by which more hypotheses than in :func:`kpbench.detectors.examine` are looked at again and fitted, to train."""
 KNOWN = 12.0
 """A hypothesis of which a judge is rightly sure, with odds over the square of this, is not shown in every epoch."""
 RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)

@@ -22,11 +22,11 @@ import numpy as np
 from kpbench import __version__
 from kpbench.dataset import shard as store
 from kpbench.dataset.generation import generate
-from kpbench.detect import LoadedDetector, load_detector
+from kpbench.detectors.interface import LoadedDetector, load_detector
+from kpbench.detectors.prediction import detect_some
 from kpbench.errors import DataError
 from kpbench.files import check_own
 from kpbench.patches.design import shipped_patches
-from kpbench.pipeline import detect_some
 from kpbench.predictions.files import Predictions, read_predictions, write_predictions
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
@@ -91,7 +91,7 @@ def bench(
     ----------
     suites : sequence of SuiteConfig
         Their ``board`` does not count.
-    detectors : names, see :func:`kpbench.detect.load_detector`.
+    detectors : names, see :func:`kpbench.detectors.load_detector`.
     out : folder; made if it is not there. What an earlier run finished there is taken over.
     workers : processes; None for one a core. Changes no result.
     progress : called as images are made and looked at.

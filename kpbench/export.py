@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from kpbench.detectors.inference import open_session
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.geometry.homography import resize
 from kpbench.network import CELL, SuperPoint
 from kpbench.patches.design import parse_patch
-from kpbench.runtime import open_session
 from kpbench.samples import SampleConfig, load_photos, make_batch
 from kpbench.train import network_of, read_checkpoint
 

@@ -30,7 +30,7 @@ from torch import Tensor, nn
 from kpbench import __version__
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
+from kpbench.files import PACKAGE, write_atomic
 from kpbench.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.recipe import NetworkConfig, Recipe, parse_recipe
@@ -168,7 +168,7 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def _shipped(path: str | Path) -> Path:
-    ours = Path(__file__).parent / "weights" / f"{path}.onnx"
+    ours = PACKAGE / "detectors" / "weights" / f"{path}.onnx"
     return ours if ours.is_file() and not Path(path).is_file() else Path(path)
 
 

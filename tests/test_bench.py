@@ -8,10 +8,10 @@ import cv2
 import pytest
 from click.testing import CliRunner
 
-from kpbench import detect
 from kpbench.benchmark import bench, images_to_do
 from kpbench.cli import main
-from kpbench.detect import load_detector
+from kpbench.detectors import interface as detect
+from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
 from kpbench.predictions.files import read_predictions
 from kpbench.synth.suite import SuiteConfig, load_suite

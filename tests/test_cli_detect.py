@@ -12,11 +12,11 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.generation import generate
-from kpbench.detect import LoadedDetector, load_detector
+from kpbench.detectors.interface import LoadedDetector, load_detector
+from kpbench.detectors.prediction import predict_images
 from kpbench.errors import DataError
 from kpbench.images import Source, image_writer
 from kpbench.patches.design import load_patches
-from kpbench.pipeline import predict_images
 from kpbench.predictions.files import read_predictions
 from kpbench.render.scene import Limits
 from kpbench.synth.synthetic import SynthConfig

@@ -3,8 +3,8 @@ import re
 import numpy as np
 import pytest
 
-from kpbench import pipeline
-from kpbench.detect import LoadedDetector, load_detector, suppress, to_grey
+from kpbench.detectors import prediction as pipeline
+from kpbench.detectors.interface import LoadedDetector, load_detector, suppress, to_grey
 from kpbench.errors import DataError
 from kpbench.types import Detections
 

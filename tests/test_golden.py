@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import kpbench
-from kpbench.detect import DETECTORS
+from kpbench.detectors.interface import DETECTORS
 
 GOLDEN = Path(__file__).parent / "golden"
 EXPECTED = json.loads((GOLDEN / "detections.json").read_text())

@@ -8,13 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
-from kpbench import verify
-from kpbench.detect import load_detector
+from kpbench.detectors import verification as verify
+from kpbench.detectors.inference import open_session
+from kpbench.detectors.interface import load_detector
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector, decode, pad_to_cells
+from kpbench.detectors.verification import Examined
 from kpbench.errors import DataError
 from kpbench.patches.design import parse_patch, shipped_patches
-from kpbench.runtime import open_session
-from kpbench.verify import Examined
 
 PATCHES = shipped_patches()
 

@@ -2,7 +2,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench.detect import load_detector
+from kpbench.detectors.interface import load_detector
 from kpbench.geometry.homography import Camera
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches

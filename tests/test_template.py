@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kpbench.degrade import effects as degrade
-from kpbench.detect import load_detector
+from kpbench.detectors.interface import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
 from kpbench.fitting import templates as match

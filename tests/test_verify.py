@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpbench import verify
+from kpbench.detectors import verification as verify
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Placement, render_scene
 

@@ -10,8 +10,8 @@ import click
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 if TYPE_CHECKING:
-    from kpbench.detect import LoadedDetector
-    from kpbench.pipeline import Predicted
+    from kpbench.detectors.interface import LoadedDetector
+    from kpbench.detectors.prediction import Predicted
 
 __all__ = ["detect"]
 
@@ -85,8 +85,8 @@ def _run(
     """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.shard import open_dataset
+    from kpbench.detectors.prediction import predict, predict_images
     from kpbench.images import open_images
-    from kpbench.pipeline import predict, predict_images
 
     if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):
         images = open_images(source, but=overlay)
@@ -112,7 +112,7 @@ def _others(config: dict[str, Any]) -> bool:
 
 def _told(name: str, patches: tuple[Path, ...], threshold: float | None) -> LoadedDetector:
     """The detector that compares images with designs, told which; it then runs in this process alone."""
-    from kpbench.detect import LoadedDetector
+    from kpbench.detectors.interface import LoadedDetector
     from kpbench.detectors.template import TemplateDetector
     from kpbench.patches.design import load_patches
 

@@ -95,9 +95,9 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     import json
 
     from kpbench.cli.progress import progress_bar
+    from kpbench.detectors.prediction import degrade_files
     from kpbench.errors import DataError
     from kpbench.images import check_apart, open_images
-    from kpbench.pipeline import degrade_files
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")

@@ -1,1 +1,1 @@
-"""The detectors that ship with kpbench; :func:`kpbench.detect.load_detector` knows them by name."""
+"""The detectors that ship with kpbench; :func:`kpbench.detectors.load_detector` knows them by name."""

@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench import verify
-from kpbench.detect import to_grey
+from kpbench.detectors import verification as verify
+from kpbench.detectors.inference import on_gpu, open_session
+from kpbench.detectors.interface import to_grey
 from kpbench.errors import DataError
 from kpbench.geometry.homography import resize, suppress
 from kpbench.patches.design import parse_patch
-from kpbench.runtime import on_gpu, open_session
 from kpbench.types import Detections, Float, UInt8
 
 __all__ = [
@@ -182,7 +182,7 @@ class SuperPointDetector:
         Least score of a detection, in [0, 1]; None: 0.5 of the network alone, 0.3 where it is verified.
     verified : bool
         Whether the network's candidates are compared with the designs, which the file holds
-        (:mod:`kpbench.verify`): that gives centre, identity and score. False: the network alone decides, at
+        (:mod:`kpbench.detectors`): that gives centre, identity and score. False: the network alone decides, at
         the image's own scale; so it is also for designs without an edge at the centre, whose pose shows nowhere.
     threads : int
         Threads of the network's runtime; 0 means as many as OpenCV may use.
@@ -205,7 +205,7 @@ class SuperPointDetector:
     def __post_init__(self) -> None:
         if not self.scales or not all(0 < scale <= 16 for scale in self.scales):
             raise DataError(f"scales are {self.scales}, expected at least one, each over 0 and up to 16")
-        ours = Path(__file__).parent.parent / "weights" / f"{self.shipped}{'' if on_gpu() else '-int8'}.onnx"
+        ours = Path(__file__).parent / "weights" / f"{self.shipped}{'' if on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
             self._session, text = open_session(self.path.read_bytes(), self.threads)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.detect import to_grey
+from kpbench.detectors.interface import to_grey
 from kpbench.errors import DataError
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting import sector_search as sectors

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 import kpbench
-from kpbench.detect import DETECTORS
+from kpbench.detectors.interface import DETECTORS
 from kpbench.synth.suite import SuiteConfig, load_suite
 from kpbench.synth.synthetic import SynthConfig
 

@@ -20,9 +20,9 @@ import cv2
 import numpy as np
 
 from kpbench import __version__
+from kpbench.detectors.program import run_program
 from kpbench.errors import DataError
 from kpbench.geometry.homography import suppress
-from kpbench.program import run_program
 from kpbench.types import Detections, UInt8
 
 __all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
@@ -40,7 +40,7 @@ DETECTORS = {
 """Name → where the shipped detector is, as ``MODULE:ATTR``."""
 
 PROGRAM = "program:"
-"""What the name of a detector begins with that is a program, see :func:`kpbench.program.run_program`."""
+"""What the name of a detector begins with that is a program, see :func:`kpbench.detectors.run_program`."""
 
 
 class Detector(Protocol):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from kpbench.dataset import shard as store
 from kpbench.dataset.drawing import draw_detections
 from kpbench.degrade import effects as degrade
-from kpbench.detect import LoadedDetector, load_detector, one_line
+from kpbench.detectors.interface import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic
 from kpbench.images import Source, image_writer
@@ -56,7 +56,7 @@ def predict(
     Parameters
     ----------
     dataset : Dataset
-    detector : name or ``MODULE:ATTR`` (see :func:`kpbench.detect.load_detector`), or a loaded one, which
+    detector : name or ``MODULE:ATTR`` (see :func:`kpbench.detectors.load_detector`), or a loaded one, which
         stays in this process.
     threshold : drop detections of a lower score, in place of the detector's own limit if it is given by name and has
         one (an attribute ``threshold``); None keeps all.
