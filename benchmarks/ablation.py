@@ -24,10 +24,10 @@ from pathlib import Path
 from torch import nn
 from tqdm import tqdm
 
-from kpbench import crops
 from kpbench.patches.design import load_patches, shipped_patches
-from kpbench.recipe import Phase, Recipe, load_recipe
-from kpbench.train import train
+from kpbench.training import crops
+from kpbench.training.loop import train
+from kpbench.training.recipe import Phase, Recipe, load_recipe
 from kpbench.workers import cores, one_thread
 
 CONFIGS = Path(__file__).parent.parent / "configs"

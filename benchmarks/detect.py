@@ -21,8 +21,8 @@ import kpbench
 from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
 from kpbench.geometry.homography import resize
-from kpbench.network import SuperPoint
-from kpbench.recipe import NetworkConfig
+from kpbench.training.network import SuperPoint
+from kpbench.training.recipe import NetworkConfig
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ centre is and which ellipse it fills, whatever its design. It is shown the place
 Its log odds are then scaled so that they hold for the places of the test set, of which most are on none.
 Prints for the test set, by radius, the share of centres within 0.1 and 0.2 of the major semi-axis, before and after,
 and of semi-axes within a tenth and a fifth. `--go-on` starts from the weights that ship (with `--epochs 0`: shows what
-they give); `--write` replaces them, `ellipse.onnx` of `kpbench/weights`.
+they give); `--write` replaces them, `ellipse.onnx` of `kpbench/detectors/weights`.
 Needs `pip install 'kpbench[train]'`.
 """
 

@@ -35,7 +35,7 @@ from kpbench.detectors.superpoint import (
     keypoint_probability,
     locate,
 )
-from kpbench.samples import SampleConfig, load_photos, make_batch
+from kpbench.training.batches import SampleConfig, load_photos, make_batch
 from kpbench.types import Float, UInt8
 from kpbench.workers import one_thread
 

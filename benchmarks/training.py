@@ -22,9 +22,9 @@ import numpy as np
 import torch
 
 from kpbench.patches.design import shipped_patches
-from kpbench.recipe import Phase, load_recipe
-from kpbench.samples import load_photos, make_batch
-from kpbench.train import start, step_once, train
+from kpbench.training.batches import load_photos, make_batch
+from kpbench.training.loop import start, step_once, train
+from kpbench.training.recipe import Phase, load_recipe
 
 ROUNDS = 3
 

@@ -12,7 +12,7 @@ shipped one is sure of, and rightly, are shown seldom and with more weight.
 Prints the detection score of the test set at several rates of false alarms an image: of the network's candidates as
 they are, and by each judge; the second one is what the detector reports. `--go-on` starts from the weights that ship
 (with `--epochs 0` it shows what they give); `--write` replaces them, `posed.onnx` and `fitted.onnx` of
-`kpbench/weights`. Needs `pip install 'kpbench[train]'`.
+`kpbench/detectors/weights`. Needs `pip install 'kpbench[train]'`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0
-"""Log odds by which more hypotheses than in :func:`kpbench.detectors.examine` are looked at again and fitted, to train."""
+"""Log odds by which more hypotheses are looked at again and fitted, to train."""
 KNOWN = 12.0
 """A hypothesis of which a judge is rightly sure, with odds over the square of this, is not shown in every epoch."""
 RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)

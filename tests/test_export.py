@@ -9,11 +9,11 @@ import torch
 
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
-from kpbench.export import export, export_int8, fold, to_onnx
-from kpbench.network import SuperPoint
 from kpbench.patches.design import shipped_patches
-from kpbench.recipe import NetworkConfig, Phase, Recipe
-from kpbench.train import initial_weights, train
+from kpbench.training.export import export, export_int8, fold, to_onnx
+from kpbench.training.loop import initial_weights, train
+from kpbench.training.network import SuperPoint
+from kpbench.training.recipe import NetworkConfig, Phase, Recipe
 
 SIZES = {"widths": (4, 4, 8, 8), "depths": (1, 2, 1, 1), "head_width": 8, "descriptor_width": 8}
 

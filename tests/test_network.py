@@ -7,8 +7,8 @@ import torch
 from safetensors.torch import save_file
 
 from kpbench.errors import DataError
-from kpbench.network import SuperPoint, grow, initialise, losses, make_targets, read_weights
-from kpbench.recipe import Loss, NetworkConfig
+from kpbench.training.network import SuperPoint, grow, initialise, losses, make_targets, read_weights
+from kpbench.training.recipe import Loss, NetworkConfig
 
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), head_width=8, descriptor_width=8)
 

@@ -12,13 +12,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from kpbench import train as training
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
-from kpbench.export import export
+from kpbench.files import PACKAGE
 from kpbench.patches.design import shipped_patches
-from kpbench.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
-from kpbench.samples import Batch, SampleConfig
+from kpbench.training import loop as training
+from kpbench.training.batches import Batch, SampleConfig
+from kpbench.training.export import export
+from kpbench.training.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), down="stride", head_width=8, descriptor_width=8)
@@ -92,7 +93,7 @@ def test_shipped_weights_are_trained_on_from_what_they_find(tmp_path, run, head_
     assert run(recipe, tmp_path, init="superpoint-small", say=said.append)
     assert said == [f"superpoint-small: {line}"]
     content, tensors = training.read_checkpoint(tmp_path / "checkpoint.safetensors")
-    detector = SuperPointDetector(Path(training.__file__).parent / "weights" / "superpoint-small.onnx")  # not in 8 bits
+    detector = SuperPointDetector(PACKAGE / "detectors" / "weights" / "superpoint-small.onnx")  # not in 8 bits
     images = np.random.default_rng(0).integers(0, 256, (2, 64, 72), np.uint8)
     with torch.inference_mode():
         ours = training.network_of(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
@@ -191,7 +192,7 @@ def test_the_papers_recipe_is_the_papers():
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.name)
 def test_shipped_recipes_survive_the_checkpoint(path):
-    from kpbench.recipe import parse_recipe
+    from kpbench.training.recipe import parse_recipe
 
     recipe = load_recipe(path)
     assert parse_recipe(json.loads(json.dumps(asdict(recipe))), "json") == recipe
@@ -279,8 +280,8 @@ def test_two_processes_train_one_network(tmp_path, photos):
     code = (
         "import hashlib, sys, torch\n"
         "from pathlib import Path\n"
-        "from kpbench import train as t\n"
-        "from kpbench.recipe import load_recipe\n"
+        "from kpbench.training import loop as t\n"
+        "from kpbench.training.recipe import load_recipe\n"
         "step = t.step_once\n"
         "def watched(state, *rest):\n"
         "    pair = step(state, *rest)\n"

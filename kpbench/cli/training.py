@@ -50,11 +50,11 @@ def train(
       torchrun --nproc-per-node 4 -m kpbench train --config configs/reference.toml --workers 4
     """
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.recipe import load_recipe
+    from kpbench.training.recipe import load_recipe
 
     recipe = load_recipe(config)
     try:
-        from kpbench import train as training
+        from kpbench.training import loop as training
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench train {INSTALL} ({error})") from None
     folder = out or Path("runs") / recipe.name
@@ -89,7 +89,7 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
       kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
     """
     try:
-        from kpbench.export import export, export_int8
+        from kpbench.training.export import export, export_int8
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench export-model {INSTALL} ({error})") from None
     from kpbench.errors import DataError

@@ -2,8 +2,8 @@
 
 A network says where it sees a keypoint and which design it takes it for. Here a small network looks at the
 surroundings of each such place and says which ellipse the patch fills, if there is one (:func:`ellipses`). The likely
-designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.fitting`), what may be a patch is fitted
-to the pixels (:func:`fitted`, with :mod:`kpbench.fitting`), and after each of the two a judge, a small network too, sees
+designs are turned within it until they agree (:func:`posed`, with :mod:`kpbench.fitting`), what may be one is fitted
+to the pixels (:func:`fitted`), and after each of the two a judge, a small network too, sees
 the place in the frame of the patch, beside the design, and what was measured. It gives the log odds that there is a
 patch of this design at this place, and how far the pose is off; the first one looks twice, the second time in the pose
 that it took for right (:func:`again`). The second one knows what the first one says, and what other patches the image

@@ -23,10 +23,10 @@ from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.geometry.homography import resize
-from kpbench.network import CELL, SuperPoint
 from kpbench.patches.design import parse_patch
-from kpbench.samples import SampleConfig, load_photos, make_batch
-from kpbench.train import network_of, read_checkpoint
+from kpbench.training.batches import SampleConfig, load_photos, make_batch
+from kpbench.training.loop import network_of, read_checkpoint
+from kpbench.training.network import CELL, SuperPoint
 
 __all__ = ["Exported", "export", "export_int8", "fold", "quantise", "to_onnx"]
 

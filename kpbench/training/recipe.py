@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
 from kpbench.files import read_toml
-from kpbench.samples import SampleConfig
+from kpbench.training.batches import SampleConfig
 
 __all__ = ["Loss", "NetworkConfig", "Phase", "Recipe", "load_recipe", "parse_recipe"]
 

@@ -1,6 +1,6 @@
 """Training: one loop over samples that are made on the fly, resumable to the bit.
 
-A recipe is a TOML file (:mod:`kpbench.recipe`). Progress is counted in samples, so that a recipe says the
+A recipe is a TOML file (:mod:`kpbench.training`). Progress is counted in samples, so that a recipe says the
 same on one processor and on eight accelerators. A checkpoint is one safetensors file with the weights,
 their running mean, the optimizer's moments and, as JSON, the recipe and the number of steps; batches are
 a function of (recipe, seed, step), hence nothing else is needed to go on as if nothing had happened.
@@ -31,10 +31,10 @@ from kpbench import __version__
 from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, write_atomic
-from kpbench.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.recipe import NetworkConfig, Recipe, parse_recipe
-from kpbench.samples import Batch, Job, load_photos, make_batch, stream
+from kpbench.training.batches import Batch, Job, load_photos, make_batch, stream
+from kpbench.training.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
+from kpbench.training.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.types import UInt8
 
 __all__ = ["State", "designs_digest", "evaluate", "network_of", "read_checkpoint", "train", "validation_set"]

@@ -1,7 +1,7 @@
 """Training samples made on the fly: a batch is a function of (config, seed, index) and of nothing else.
 
 Two kinds: ``scenes`` are whole images as ``kpbench synth`` writes them; ``crops`` are small windows
-(:mod:`kpbench.crops`) with degradations whose strength the training loop raises.
+(:mod:`kpbench.training`) with degradations whose strength the training loop raises.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch
 from kpbench.render.background import PhotoFolder, decode_photo, procedural
 from kpbench.render.scene import Limits, random_placements, render_scene
+from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.types import UInt8
 from kpbench.workers import end_with_parent, one_thread
 

@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from kpbench.errors import DataError
-from kpbench.recipe import Loss, NetworkConfig
+from kpbench.training.recipe import Loss, NetworkConfig
 
 __all__ = [
     "CELL",
@@ -309,7 +309,7 @@ class Targets:
 
 
 def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: str) -> Targets:
-    """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.samples.Batch`) on images of that size."""
+    """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.training.Batch`) on images of that size."""
     count, h, w = len(keypoints), height // CELL, width // CELL
     xy, patch, ignore = keypoints[..., :2], keypoints[..., 2], keypoints[..., 3]
     wanted = (patch >= 0) & (ignore == 0)

@@ -66,7 +66,7 @@ def make_crops(
     count: int,
     severity: float,
 ) -> tuple[UInt8, Float32]:
-    """Crops (count, height, width) and their keypoints (count, K, 4), see :class:`kpbench.samples.Batch`."""
+    """Crops (count, height, width) and their keypoints (count, K, 4), see :class:`kpbench.training.Batch`."""
     images = np.zeros((count, height, width), np.uint8)
     keypoints = no_keypoints(count)
     discs: list[list[Disc]] = []

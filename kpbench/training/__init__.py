@@ -1,0 +1,1 @@
+"""How the weights are made: of the network and of its verifier."""
