@@ -33,9 +33,10 @@ from tqdm import tqdm
 
 import kpbench
 from kpbench.detectors import verification as verify
-from kpbench.detectors.interface import suppress, to_grey
+from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
 from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
+from kpbench.geometry.homography import suppress
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0

@@ -27,12 +27,11 @@ from kpbench.detectors.prediction import detect_some
 from kpbench.errors import DataError
 from kpbench.files import check_own
 from kpbench.patches.design import shipped_patches
-from kpbench.predictions.files import Predictions, read_predictions, write_predictions
+from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
+from kpbench.types import Predictions
 from kpbench.workers import Progress, run_pieces
-
-__all__ = ["Benched", "bench", "images_to_do"]
 
 PART = 32  # images whose detections are kept together
 

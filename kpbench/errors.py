@@ -14,8 +14,6 @@ The command line prints the message and exits with 1; a library user catches ``K
 
 from __future__ import annotations
 
-__all__ = ["AugmentationError", "DataError", "DesignError", "GateFailed", "KpbenchError", "PredictionsError"]
-
 
 class KpbenchError(Exception):
     """Base of all errors that kpbench raises on purpose."""

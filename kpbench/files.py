@@ -15,20 +15,6 @@ from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "PACKAGE",
-    "check_own",
-    "check_targets",
-    "folder_at",
-    "image_files",
-    "is_local",
-    "read_text",
-    "read_toml",
-    "shipped_folder",
-    "write_atomic",
-]
-
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
 PACKAGE = Path(__file__).parent

@@ -14,8 +14,6 @@ from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files, write_atomic
 from kpbench.types import UInt8
 
-__all__ = ["Source", "check_apart", "image_writer", "open_images"]
-
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 PICTURES = (".png", ".jpg", ".jpeg")
 

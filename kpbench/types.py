@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from kpbench.errors import PredictionsError
 
-__all__ = ["KEYPOINT_DTYPE", "Detections", "Float", "Int", "Misfit", "Predictions", "Truth", "UInt8", "offsets_of"]
-
 Int = NDArray[np.int64]
 Float = NDArray[np.float64]
 UInt8 = NDArray[np.uint8]

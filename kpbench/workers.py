@@ -27,8 +27,6 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from kpbench.errors import DataError
 
-__all__ = ["Progress", "cores", "dask_executor", "end_with_parent", "one_blas_thread", "one_thread", "run_pieces"]
-
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 Progress = Callable[[int], None]

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from kpbench.detectors import prediction as pipeline
-from kpbench.detectors.interface import LoadedDetector, load_detector, suppress, to_grey
+from kpbench.detectors.interface import LoadedDetector, load_detector, to_grey
 from kpbench.errors import DataError
+from kpbench.geometry.homography import suppress
 from kpbench.types import Detections
 
 MODULE = """

@@ -29,8 +29,6 @@ from kpbench.geometry.coverage import box_around, coverage
 from kpbench.patches.design import Patch
 from kpbench.types import Float
 
-__all__ = ["Float32", "Grid", "attitudes", "blurred", "images", "moments", "seen_cells", "window_weights"]
-
 TILTS_DEG = (0.0, 30.0, 60.0)
 DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # of the tilt, in the image
 TURNS = 24  # rotations in the plane that are compared, 15 degrees apart

@@ -12,8 +12,6 @@ from kpbench.geometry.outline import Arc, circle, move, rectangle
 from kpbench.patches.design import Patch
 from kpbench.printing.page import Page, Shape, Text
 
-__all__ = ["design_figure"]
-
 ROW, TOP, LEFT = 42.0, 14.0, 6.0  # mm
 FONT = 2.6
 ICON = 13.0  # radius

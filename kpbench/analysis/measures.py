@@ -34,26 +34,6 @@ from kpbench.geometry.homography import Camera, plane_to_camera, projected_disc,
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 
-__all__ = [
-    "PAIR_STEPS",
-    "STEPS",
-    "Analysis",
-    "Bound",
-    "DesignReport",
-    "analyse",
-    "basin",
-    "bound",
-    "correlation_and_distance",
-    "disc_bound",
-    "mirrored_distance",
-    "natural_response",
-    "pixels_needed",
-    "sample_windows",
-    "symmetry_order",
-    "tilt_bias",
-    "turned_distance",
-]
-
 NOISE, CONTRAST = 10.0, 180.0  # grey levels
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
 SEEN_BASIN = (1.0, 1 / 2, 1 / 3)

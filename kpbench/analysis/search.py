@@ -35,8 +35,6 @@ from kpbench.analysis.measures import (
 from kpbench.patches.design import Patch, SemiCircle
 from kpbench.types import Float, UInt8
 
-__all__ = ["FAMILY_GRID", "Family", "SearchResult", "best_sets", "enumerate_family", "search"]
-
 RADII = (1.0, 2 / 3, 1 / 2, 1 / 3)
 ANGLES_DEG = tuple(45.0 * n for n in range(8))
 SEMICIRCLES = 3

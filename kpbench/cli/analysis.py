@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from kpbench.analysis.search import SearchResult
     from kpbench.types import UInt8
 
-__all__ = ["analyze_patches"]
-
 
 @click.command("analyze-patches")
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path))

@@ -14,8 +14,6 @@ from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
 if TYPE_CHECKING:
     from kpbench.benchmark import Benched
 
-__all__ = ["bench"]
-
 
 @click.command()
 @click.option("--suite", "suites", multiple=True, default=["paper-v1"], show_default=True, help="Repeatable.")

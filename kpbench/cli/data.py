@@ -9,8 +9,6 @@ import click
 
 from kpbench.cli.options import PATCHES, SEED, SIZE, Two, run_options
 
-__all__ = ["export", "inspect", "merge", "preview", "synth", "verify"]
-
 DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
 
 

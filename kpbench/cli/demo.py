@@ -6,8 +6,6 @@ from pathlib import Path
 
 import click
 
-__all__ = ["demo"]
-
 
 @click.command()
 @click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-demo"), show_default=True)

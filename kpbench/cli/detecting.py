@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from kpbench.detectors.interface import LoadedDetector
     from kpbench.detectors.prediction import Predicted
 
-__all__ = ["detect"]
-
 
 @click.command()
 @click.argument("source")

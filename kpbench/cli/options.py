@@ -9,9 +9,6 @@ from typing import Any, Generic, TypeVar
 
 import click
 
-__all__ = ["FINITE", "ONLY", "PATCHES", "SEED", "SIZE", "WORKERS", "Finite", "Two", "run_options"]
-
-
 Number = TypeVar("Number", bound=float)
 
 

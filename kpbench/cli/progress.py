@@ -14,8 +14,6 @@ from kpbench.dataset.generation import Recipe, generate, generate_part
 from kpbench.dataset.shard import Dataset
 from kpbench.workers import Progress, dask_executor
 
-__all__ = ["progress_bar", "tell_dataset", "write_dataset"]
-
 
 @contextmanager
 def progress_bar(total: int | None, what: str) -> Iterator[Progress]:

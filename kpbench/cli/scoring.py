@@ -14,13 +14,11 @@ from kpbench.cli.options import Finite
 if TYPE_CHECKING:
     from kpbench.dataset.shard import Dataset
     from kpbench.predictions.coco import CocoDataset
-    from kpbench.predictions.files import Predictions
     from kpbench.report.tables import Table
     from kpbench.scoring.board_pose import PoseGroup
     from kpbench.scoring.comparison import Comparison
     from kpbench.scoring.scores import Scores
-
-__all__ = ["compare", "score"]
+    from kpbench.types import Predictions
 
 
 class Limit(click.ParamType[tuple[str, float]]):

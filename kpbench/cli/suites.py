@@ -9,8 +9,6 @@ import click
 
 from kpbench.cli.options import FINITE, ONLY, SEED, SIZE, run_options
 
-__all__ = ["degrade", "suite"]
-
 
 class Distortion(click.ParamType[tuple[float, ...]]):
     """``k1,k2,p1,p2,k3`` as a tuple; trailing ones may be left out."""

@@ -8,8 +8,6 @@ import click
 
 from kpbench.cli.options import PATCHES
 
-__all__ = ["export_model", "train"]
-
 INSTALL = "needs PyTorch: pip install 'kpbench[train]'"
 
 

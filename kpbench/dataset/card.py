@@ -15,8 +15,6 @@ from kpbench.dataset.shard import Dataset
 from kpbench.files import write_atomic
 from kpbench.types import Float, UInt8
 
-__all__ = ["FILES", "Histogram", "facts", "histograms", "names", "overview", "write_card"]
-
 FILES = ("README.md", "preview.png")
 """What :func:`write_card` writes."""
 

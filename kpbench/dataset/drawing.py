@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from kpbench.types import Detections, UInt8
 
-__all__ = ["contact_sheet", "draw_detections", "draw_keypoints"]
-
 # one colour an id, distinct to colour-blind eyes (Okabe and Ito 2008), RGB
 COLOURS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167))
 

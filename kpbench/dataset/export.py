@@ -23,8 +23,6 @@ from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
-__all__ = ["FORMATS", "export_dataset"]
-
 Progress = Callable[[int], None]
 
 

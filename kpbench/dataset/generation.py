@@ -28,8 +28,6 @@ from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.workers import Progress, run_pieces
 
-__all__ = ["Recipe", "Run", "generate", "generate_part", "merge"]
-
 LOCK = ".kpbench.lock"
 
 

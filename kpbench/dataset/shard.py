@@ -25,8 +25,6 @@ from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.types import KEYPOINT_DTYPE, Truth, UInt8
 
-__all__ = ["Dataset", "Sample", "encode_shard", "open_dataset", "write_manifest"]
-
 SCHEMA = "kpbench.dataset/1"
 MANIFEST = "dataset.json"
 # libdeflate: the output of ISA-L, zlib-ng and zlib-rs may depend on what else was in memory (docs/dataset.md)

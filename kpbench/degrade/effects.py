@@ -23,33 +23,6 @@ from kpbench.geometry.coverage import Box, box_around, coverage
 from kpbench.render.scene import Mask, inside_image
 from kpbench.types import Float, UInt8
 
-__all__ = [
-    "LADDER",
-    "Rungs",
-    "albumentations",
-    "apply",
-    "blur",
-    "brightness",
-    "climb",
-    "defocus",
-    "dimming",
-    "flare",
-    "gaussian_blur",
-    "jpeg",
-    "ladder_mix",
-    "low_light",
-    "motion_blur",
-    "noise",
-    "occlusion",
-    "occlusion_cover",
-    "paper_mix",
-    "rain",
-    "rainfall",
-    "shadow",
-    "shadow_edge",
-    "share_open",
-]
-
 Effect = dict[str, Any]
 
 BORDER = cv2.BORDER_REFLECT_101

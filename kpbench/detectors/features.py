@@ -14,8 +14,6 @@ import numpy as np
 from kpbench.detectors.interface import to_grey
 from kpbench.types import Detections, UInt8
 
-__all__ = ["orb", "sift"]
-
 
 def orb(image: UInt8) -> Detections:
     """Detections without identities of one image, uint8 (H, W) or RGB (H, W, 3), strongest first."""

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 
-__all__ = ["Session", "on_gpu", "open_session"]
-
 Float32 = NDArray[np.float32]
 
 

@@ -22,10 +22,7 @@ import numpy as np
 from kpbench import __version__
 from kpbench.detectors.program import run_program
 from kpbench.errors import DataError
-from kpbench.geometry.homography import suppress
 from kpbench.types import Detections, UInt8
-
-__all__ = ["DETECTORS", "Detector", "LoadedDetector", "load_detector", "suppress", "to_grey"]
 
 DETECTORS = {
     "template": "kpbench.detectors.template:TemplateDetector",

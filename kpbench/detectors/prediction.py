@@ -25,8 +25,6 @@ from kpbench.render.scene import stream
 from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_pieces
 
-__all__ = ["Predicted", "degrade_files", "detect_some", "predict", "predict_images"]
-
 
 @dataclass(frozen=True)
 class Predicted:

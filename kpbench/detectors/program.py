@@ -14,8 +14,6 @@ from kpbench.errors import DataError
 from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
 
-__all__ = ["run_program"]
-
 
 def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
     """Run ``COMMAND IMAGES OUT``: a folder with 00000000.png, 00000001.png, … and the JSON file to write.

@@ -25,16 +25,6 @@ from kpbench.geometry.homography import resize, suppress
 from kpbench.patches.design import parse_patch
 from kpbench.types import Detections, Float, UInt8
 
-__all__ = [
-    "Decoding",
-    "SmallSuperPointDetector",
-    "SuperPointDetector",
-    "decode",
-    "identify",
-    "locate",
-    "pad_to_cells",
-]
-
 CELL = 8
 SCHEMA = "kpbench.superpoint/1"
 Float32 = NDArray[np.float32]

@@ -15,8 +15,6 @@ from kpbench.errors import DataError
 from kpbench.patches.tag_boards import charuco_pattern, dictionary
 from kpbench.types import Detections, UInt8
 
-__all__ = ["AprilTagDetector", "ArucoDetector", "CharucoDetector"]
-
 
 class ArucoDetector:
     """OpenCV's ArUco detector, corners refined with lines along the edges, which detects most of its ways.

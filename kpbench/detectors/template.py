@@ -25,8 +25,6 @@ from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, UInt8
 from kpbench.workers import one_blas_thread
 
-__all__ = ["TemplateDetector", "crossings"]
-
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 

@@ -33,24 +33,6 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 from kpbench.workers import one_blas_thread
 
-__all__ = [
-    "FITTED",
-    "POSED",
-    "Examined",
-    "Hypotheses",
-    "again",
-    "distinct",
-    "ellipses",
-    "examine",
-    "fitted",
-    "inputs",
-    "judged",
-    "likeliest",
-    "moved",
-    "posed",
-    "version",
-]
-
 NCC = "-log(1.01 - correlation of the whole design)"
 POSED = (
     "log odds of the network's score",

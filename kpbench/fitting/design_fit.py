@@ -19,8 +19,6 @@ from kpbench.geometry.coverage import Box, coverage
 from kpbench.patches.design import Patch
 from kpbench.types import Float
 
-__all__ = ["Fit", "fit"]
-
 Float32 = NDArray[np.float32]
 
 

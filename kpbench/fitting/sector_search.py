@@ -33,8 +33,6 @@ from kpbench.fitting.templates import (
 from kpbench.patches.design import Patch
 from kpbench.types import Float
 
-__all__ = ["RING_PX", "alike", "extend", "likeness", "search"]
-
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
 

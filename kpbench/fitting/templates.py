@@ -25,28 +25,6 @@ from numpy.typing import NDArray
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 
-__all__ = [
-    "Bank",
-    "Picture",
-    "Poses",
-    "Templates",
-    "align",
-    "bank",
-    "blurred",
-    "coarsest_level",
-    "look_up",
-    "normalise",
-    "outside_image",
-    "pyramid",
-    "rotated",
-    "sample",
-    "short_axis",
-    "soft_ink",
-    "surroundings",
-    "turn",
-    "view",
-]
-
 Float32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from kpbench.types import Float
 
-__all__ = ["Box", "box_around", "coverage", "edge_coverage"]
-
 Box = tuple[int, int, int, int]
 """Columns and rows of a pixel rectangle: (x, y, width, height); may reach outside the image."""
 

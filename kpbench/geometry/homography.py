@@ -21,19 +21,6 @@ from scipy.spatial import cKDTree
 
 from kpbench.types import Float, UInt8
 
-__all__ = [
-    "Camera",
-    "Ellipse",
-    "jacobian",
-    "plane_to_camera",
-    "project",
-    "projected_disc",
-    "projected_discs",
-    "resize",
-    "rotation_xyz",
-    "suppress",
-]
-
 
 def project(H_a2b: Float, points_a: ArrayLike) -> Float:
     """Map points through a homography.

@@ -13,8 +13,6 @@ import numpy as np
 
 from kpbench.types import Float
 
-__all__ = ["Arc", "Contour", "Line", "Region", "circle", "flatten", "move", "rectangle"]
-
 
 @dataclass(frozen=True)
 class Line:

@@ -21,8 +21,6 @@ from kpbench.geometry.outline import cos_sin_deg
 from kpbench.patches.design import Patch, load_patches, shipped_patches, unit_polygons
 from kpbench.types import Float
 
-__all__ = ["Board", "BoardKeypoint", "CameraBoard", "find_patch", "grid_board", "hexagon_board", "load_board"]
-
 TOML_SCHEMA = "kpbench.board-design/1"
 HEXAGON_DIAMETER = 0.16  # of the board's side, from the paper's 16-px patch on a board of 0.5 % of the image
 HEXAGON_CIRCUMRADIUS = 0.36

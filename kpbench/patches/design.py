@@ -24,8 +24,6 @@ from kpbench.files import read_toml, shipped_folder
 from kpbench.geometry.outline import Arc, Contour, Line, Region, circle, cos_sin_deg, flatten
 from kpbench.types import Float
 
-__all__ = ["Patch", "SemiCircle", "load_patch", "load_patches", "parse_patch", "shipped_patches"]
-
 SCHEMA = "kpbench.patch/1"
 INKS = ("black", "white", "invert")
 

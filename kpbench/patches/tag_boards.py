@@ -18,8 +18,6 @@ from kpbench.geometry.outline import circle, flatten
 from kpbench.patches.board import HEXAGON_DIAMETER
 from kpbench.types import Float
 
-__all__ = ["TAG_BOARDS", "Corner", "TagBoard", "charuco_pattern", "dictionary", "tag_board"]
-
 TAG_BOARDS = ("aruco", "apriltag", "charuco")
 DICTIONARIES = {
     "aruco": cv2.aruco.DICT_4X4_50,

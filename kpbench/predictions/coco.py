@@ -19,8 +19,6 @@ from kpbench.predictions.decode import cut, kind, parse, records, typed, without
 from kpbench.predictions.table_files import from_table
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
-__all__ = ["CocoDataset", "coco_results", "open_coco"]
-
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]  # a patch ID plus 1
 Point = tuple[float, float, float]

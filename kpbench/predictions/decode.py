@@ -17,8 +17,6 @@ import msgspec
 
 from kpbench.errors import PredictionsError
 
-__all__ = ["cut", "kind", "parse", "records", "short", "typed", "without_gc"]
-
 PIECE_BYTES = 4 * 2**20  # of JSON that is decoded at a time
 
 Record = TypeVar("Record", bound=msgspec.Struct)

@@ -17,8 +17,6 @@ from kpbench.predictions import table_files as columns
 from kpbench.predictions.decode import without_gc
 from kpbench.types import Predictions
 
-__all__ = ["Predictions", "check_target", "read_predictions", "write_predictions"]
-
 READERS: dict[str, Callable[[Path], Predictions]] = {
     ".json": records.read_json,
     ".jsonl": records.read_jsonl,

@@ -8,8 +8,6 @@ from kpbench.errors import PredictionsError
 from kpbench.predictions.decode import kind
 from kpbench.types import Predictions
 
-__all__ = ["SCHEMA", "header_of", "read_header"]
-
 SCHEMA = "kpbench.predictions/1"
 HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 

@@ -16,8 +16,6 @@ from kpbench.predictions.decode import PIECE_BYTES, cut, kind, parse, records, t
 from kpbench.predictions.header import SCHEMA, header_of, read_header
 from kpbench.types import Float, Int, Misfit, Predictions, offsets_of
 
-__all__ = ["read_json", "read_jsonl", "write_json", "write_jsonl"]
-
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 

@@ -20,8 +20,6 @@ from kpbench.predictions.decode import parse, short
 from kpbench.predictions.header import header_of, read_header
 from kpbench.types import Predictions, offsets_of
 
-__all__ = ["COLUMNS", "from_table", "read_csv", "read_h5", "read_parquet", "write_csv", "write_h5", "write_parquet"]
-
 COLUMNS = ("image_id", "x", "y", "score", "id")
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
 

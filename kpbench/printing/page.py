@@ -25,8 +25,6 @@ from numpy.typing import NDArray
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import Arc, Contour, Line, Region, flatten
 
-__all__ = ["INK", "WRITERS", "Page", "Shape", "Text", "mirror", "px_per_mm"]
-
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
 SVG_FONTS = "Helvetica, Arial, sans-serif"

@@ -26,8 +26,6 @@ from kpbench.printing.page import CUT, INK, MARKS, WRITERS, Page, Shape, Text, m
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
 from kpbench.printing.tiling import Tile, tiles_of
 
-__all__ = ["PAPERS", "Paper", "Sheet", "board_sheet", "parse_paper", "patch_sheet", "save_sheet"]
-
 PAPERS = {  # mm; ISO 216 and ANSI Y14.1
     "a4": (210.0, 297.0),
     "a3": (297.0, 420.0),

@@ -15,8 +15,6 @@ from typing import Any
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
 
-__all__ = ["BOARD_SCHEMA", "SHEET_SCHEMA", "correct_sidecars", "corrected", "nm"]
-
 BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
 

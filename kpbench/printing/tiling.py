@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from kpbench.errors import DesignError
 from kpbench.patches.board import Board
 
-__all__ = ["Tile", "tiles_of"]
-
 SEAM_CLEARANCE = 1.0  # mm between a seam and any patch: what a careful cut with a knife needs
 
 

@@ -18,8 +18,6 @@ from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
 from kpbench.types import Float, UInt8
 
-__all__ = ["Background", "PhotoFolder", "procedural"]
-
 CACHE_BYTES = 128 * 2**20
 
 
@@ -124,6 +122,7 @@ class PhotoFolder:
 
 
 def decode_photo(path: Path, channels: int) -> UInt8 | None:
+    """Decode a photograph as grey (channels 1) or RGB (3), whatever its EXIF says; None if it cannot be decoded."""
     flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         data = np.fromfile(path, np.uint8)

@@ -23,8 +23,6 @@ from kpbench.patches.board import CameraBoard
 from kpbench.render.scene import Mask, Rendered, inside_image, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
-__all__ = ["Look", "Pose", "board_keypoints", "outline_px", "polygon_area", "pose_board", "render_board"]
-
 EDGE = 0.008  # of the board's shorter side: the band along its cut edge
 MARGIN = 0.01  # of the image's width, kept free around the board
 SHADOW_REACH = 0.4  # board sides that the shadow is moved for a slope of 1

@@ -14,8 +14,6 @@ import numpy as np
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float, UInt8
 
-__all__ = ["draw_lookalikes"]
-
 
 @dataclass(frozen=True)
 class Look:

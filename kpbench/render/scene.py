@@ -17,22 +17,6 @@ from kpbench.geometry.homography import projected_discs
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
-__all__ = [
-    "Limits",
-    "Mask",
-    "Placement",
-    "Rendered",
-    "measure_contrast",
-    "paint",
-    "random_placements",
-    "random_poses",
-    "rasterise",
-    "render_scene",
-    "share_inside",
-    "stream",
-    "tabulate",
-]
-
 
 @dataclass(frozen=True)
 class Limits:

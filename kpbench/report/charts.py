@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from html import escape
 from typing import TypeVar
 
-__all__ = ["COLOURS", "STYLE", "Series", "bar_chart", "line_chart", "standalone"]
-
 COLOURS = 9  # classes s0 … s8; more series start again, dashed
 # Readable on white and on near-black and apart to colour-blind eyes; after Okabe and Ito 2008
 STYLE = """\

@@ -15,27 +15,6 @@ from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Group, Scores
 
-__all__ = [
-    "Figure",
-    "breakpoint_table",
-    "condition_table",
-    "confusion_table",
-    "count_table",
-    "difference_table",
-    "eps_chart",
-    "estimate",
-    "group_table",
-    "overview_table",
-    "paper_table",
-    "pose_table",
-    "precision_recall_chart",
-    "radius_chart",
-    "severity_chart",
-    "synthetic_table",
-    "taxonomy_charts",
-    "verdict_table",
-]
-
 DIFFERENCES = len(COMPARED)
 PAPER_STYLE = 7  # grey
 SHORT = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from kpbench.scoring.metrics import PAPER_METRICS
 
-__all__ = ["PAPER", "PaperTable", "paper_value"]
-
 Row = tuple[float, ...]
 
 

@@ -48,21 +48,6 @@ if TYPE_CHECKING:
     from kpbench.predictions.coco import CocoDataset
     from kpbench.report.worst_cases import Case
 
-__all__ = [
-    "Report",
-    "Section",
-    "comparison_file",
-    "provenance",
-    "scores_csv",
-    "scores_file",
-    "sections",
-    "to_html",
-    "to_latex_report",
-    "to_markdown_report",
-    "write_report",
-]
-
-
 COMPARISON_SCHEMA = "kpbench.comparison/1"
 
 

@@ -10,8 +10,6 @@ from typing import NamedTuple
 
 from kpbench.scoring.bootstrap import Interval
 
-__all__ = ["WRITERS", "Cell", "Estimate", "Table", "cell_text", "to_csv", "to_latex", "to_markdown", "to_plain"]
-
 
 class Estimate(NamedTuple):
     """A number with its 95 % interval; None where it is undefined or has none."""

@@ -13,8 +13,6 @@ from kpbench.scoring.metrics import SUMS
 from kpbench.scoring.outcomes import Tally
 from kpbench.types import UInt8
 
-__all__ = ["Case", "Mark", "worst_cases"]
-
 MOST_SIDE_PX = 800  # larger images are shrunk; the marks keep the image's own px
 JPEG_QUALITY = 82
 KINDS = {MATCHED: "matched", DUPLICATE: "duplicate", NEAR_MISS: "near miss", CLUTTER: "clutter"}

@@ -18,8 +18,6 @@ from scipy.sparse.csgraph import connected_components
 
 from kpbench.types import Float
 
-__all__ = ["CLUTTER", "DUPLICATE", "MATCHED", "NEAR_MISS", "Matches", "match", "matched_within"]
-
 Int = NDArray[np.int64]
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
 """What a detection is: see :class:`Matches`."""

@@ -13,8 +13,6 @@ from kpbench.scoring.outcomes import Tally
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
-__all__ = ["PoseErrors", "PoseGroup", "pose_errors", "pose_groups"]
-
 LEAST_POINTS = 4  # that fix the pose of a plane
 
 

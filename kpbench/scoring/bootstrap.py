@@ -18,8 +18,6 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 from kpbench.types import Float
 
-__all__ = ["Interval", "by_scene", "intervals"]
-
 Int = NDArray[np.int64]
 Interval = tuple[float, float]
 MOST_KINDS = 1000  # different scenes that a bootstrap tells apart

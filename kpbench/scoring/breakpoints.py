@@ -14,8 +14,6 @@ from kpbench.scoring.metrics import SUMS
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
-__all__ = ["LIMIT", "Breakpoint", "breakpoints"]
-
 LIMIT = 0.9
 TRUTHS, MATCHED = SUMS.index("truths"), SUMS.index("matched")
 

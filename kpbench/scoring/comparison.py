@@ -15,8 +15,6 @@ from kpbench.scoring.metrics import LABELS, PAPER_METRICS, SUMS, ratios
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
-__all__ = ["Comparison", "Difference", "check_regression", "compare"]
-
 METRICS = (*PAPER_METRICS, "precision", "f1")
 LOWER_IS_BETTER = ("average_false_alarm",)
 

@@ -13,18 +13,6 @@ from numpy.typing import NDArray
 
 from kpbench.types import Float
 
-__all__ = [
-    "COUNTS",
-    "LABELS",
-    "METRICS",
-    "PAPER_METRICS",
-    "RATIOS",
-    "SUMS",
-    "error_metrics",
-    "precision_recall",
-    "ratios",
-]
-
 SUMS = (
     "images",
     "truths",

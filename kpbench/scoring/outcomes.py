@@ -14,8 +14,6 @@ from kpbench.errors import DataError, PredictionsError
 from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, Matches, match
 from kpbench.types import Float, Predictions, Truth
 
-__all__ = ["Settings", "Tally", "tally"]
-
 Int = NDArray[np.int64]
 
 

@@ -30,8 +30,6 @@ from kpbench.scoring.metrics import COUNTS, METRICS, SUMS, error_metrics, precis
 from kpbench.scoring.outcomes import Settings, Tally, tally
 from kpbench.types import Detections, Predictions, Truth
 
-__all__ = ["Group", "Scores", "check_gates", "evaluate", "score", "summarise"]
-
 SCHEMA = "kpbench.scores/1"
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)  # bins are low < radius <= high
 EPS_GRID = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
@@ -344,7 +342,9 @@ class HasTruth(Protocol):
     """What a dataset offers to the evaluator."""
 
     @property
-    def truth(self) -> Truth: ...
+    def truth(self) -> Truth:
+        """The true keypoints."""
+        ...
 
 
 def score(

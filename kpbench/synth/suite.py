@@ -30,8 +30,6 @@ from kpbench.render.board_view import Look, Pose, board_keypoints, pose_board, r
 from kpbench.render.scene import measure_contrast, stream
 from kpbench.types import Float
 
-__all__ = ["Condition", "Shot", "Suite", "SuiteConfig", "board_in_view", "load_suite", "shipped_suites"]
-
 SCHEMA = "kpbench.suite/1"
 BOARD_SIDE_MM = 187.5  # a disc of 30 mm
 # Streams of random numbers of one scene; 0 to 2 belong to synth

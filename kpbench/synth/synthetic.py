@@ -28,8 +28,6 @@ from kpbench.render.scene import (
 )
 from kpbench.synth.user_pipeline import augment
 
-__all__ = ["SynthConfig"]
-
 BACKGROUND, SCENE, DETERIORATION, LOOKALIKES, AUGMENTATION = range(5)
 
 

@@ -26,8 +26,6 @@ from kpbench.geometry.homography import project
 from kpbench.render.scene import Placement
 from kpbench.types import UInt8
 
-__all__ = ["augment", "load_augmentation"]
-
 WHOLE = 0.999
 """Least share of a pixel that came from the image and not from what a transform filled in."""
 LEAST_PIXELS = 12

@@ -28,8 +28,6 @@ from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, win
 from kpbench.types import UInt8
 from kpbench.workers import end_with_parent, one_thread
 
-__all__ = ["Batch", "Job", "SampleConfig", "load_photos", "make_batch", "stream"]
-
 Float32 = NDArray[np.float32]
 
 VALIDATION_EVERY = 10

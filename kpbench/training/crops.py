@@ -22,8 +22,6 @@ from kpbench.render.lookalikes import draw_lookalikes
 from kpbench.render.scene import Limits, Placement, paint, random_poses, rasterise
 from kpbench.types import Float, UInt8
 
-__all__ = ["MOST_KEYPOINTS", "make_crops", "no_keypoints", "window"]
-
 Float32 = NDArray[np.float32]
 
 MOST_KEYPOINTS = 12

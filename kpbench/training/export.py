@@ -28,8 +28,6 @@ from kpbench.training.batches import SampleConfig, load_photos, make_batch
 from kpbench.training.loop import network_of, read_checkpoint
 from kpbench.training.network import CELL, SuperPoint
 
-__all__ = ["Exported", "export", "export_int8", "fold", "quantise", "to_onnx"]
-
 OPSET = 17
 LARGEST_DIFFERENCE = 1e-4
 

@@ -37,8 +37,6 @@ from kpbench.training.network import SuperPoint, grow, initialise, is_folded, lo
 from kpbench.training.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.types import UInt8
 
-__all__ = ["State", "designs_digest", "evaluate", "network_of", "read_checkpoint", "train", "validation_set"]
-
 SCHEMA = "kpbench.checkpoint/1"
 SAVE_EVERY = 5.0
 """Minutes between checkpoints."""

@@ -27,19 +27,6 @@ from torch import Tensor, nn
 from kpbench.errors import DataError
 from kpbench.training.recipe import Loss, NetworkConfig
 
-__all__ = [
-    "CELL",
-    "SuperPoint",
-    "Targets",
-    "grow",
-    "initialise",
-    "is_folded",
-    "losses",
-    "make_targets",
-    "read_weights",
-    "unfold",
-]
-
 CELL = 8
 """Side of a cell, px: three stages of the encoder halve the image."""
 

@@ -12,8 +12,6 @@ from kpbench.errors import DataError
 from kpbench.files import read_toml
 from kpbench.training.batches import SampleConfig
 
-__all__ = ["Loss", "NetworkConfig", "Phase", "Recipe", "load_recipe", "parse_recipe"]
-
 
 @dataclass(frozen=True)
 class NetworkConfig:
