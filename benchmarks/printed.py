@@ -34,8 +34,12 @@ from kpbench.geometry.coverage import coverage
 from kpbench.geometry.outline import Line, flatten, move
 from kpbench.patches.board import grid_board, hexagon_board
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.printing.page import Page, Shape, dxf, pdf, png, px_per_mm, svg
+from kpbench.printing.dxf import dxf
+from kpbench.printing.page import Page, Shape
+from kpbench.printing.pdf import pdf
+from kpbench.printing.png import png, px_per_mm
 from kpbench.printing.sheet import Paper, Sheet, board_sheet, patch_sheet
+from kpbench.printing.svg import svg
 from kpbench.types import Float
 
 Image.MAX_IMAGE_PIXELS = None

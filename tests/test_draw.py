@@ -15,7 +15,12 @@ from PIL import Image
 import kpbench.printing.page
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import Arc, Line, circle, move, rectangle
-from kpbench.printing.page import CUT, INK, MARKS, WRITERS, Page, Shape, Text, dxf, mirror, pdf, png, px_per_mm, svg
+from kpbench.printing.dxf import dxf
+from kpbench.printing.formats import WRITERS
+from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror
+from kpbench.printing.pdf import pdf
+from kpbench.printing.png import png, px_per_mm
+from kpbench.printing.svg import svg
 
 RADIUS, AT = 15.0, (40.3, 61.7)
 HALF_DISC = ((Arc(0, 0, 1, 0, 180), Line(-1, 0, 1, 0)),)

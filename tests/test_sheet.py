@@ -15,8 +15,13 @@ from kpbench.errors import DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import parse_patch, shipped_patches
-from kpbench.printing.page import CUT, INK, MARKS, WRITERS, dxf, pdf, png, svg
+from kpbench.printing.dxf import dxf
+from kpbench.printing.formats import WRITERS
+from kpbench.printing.page import CUT, INK, MARKS
+from kpbench.printing.pdf import pdf
+from kpbench.printing.png import png
 from kpbench.printing.sheet import PAPERS, Paper, board_sheet, parse_paper, patch_sheet, save_sheet
+from kpbench.printing.svg import svg
 
 A4 = Paper(210, 297)
 # A rim and a quiet zone, rings, three directions of edges, and no symmetry.

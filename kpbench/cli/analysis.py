@@ -42,7 +42,7 @@ def analyze_patches(
     from kpbench.analysis.figure import design_figure
     from kpbench.files import write_atomic
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.printing.page import WRITERS
+    from kpbench.printing.formats import WRITERS
 
     if searching and files:
         raise click.UsageError("--search goes through a whole family of designs and takes no FILES")

@@ -22,7 +22,9 @@ from kpbench.files import write_atomic
 from kpbench.geometry.outline import Line, Region, circle, move, rectangle
 from kpbench.patches.board import Board
 from kpbench.patches.design import Patch
-from kpbench.printing.page import CUT, INK, MARKS, WRITERS, Page, Shape, Text, mirror, px_per_mm
+from kpbench.printing.formats import WRITERS
+from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror
+from kpbench.printing.png import px_per_mm
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
 from kpbench.printing.tiling import Tile, tiles_of
 

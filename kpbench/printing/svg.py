@@ -1,0 +1,46 @@
+"""SVG in millimetres, with true arcs."""
+
+from __future__ import annotations
+
+from xml.sax.saxutils import escape
+
+from kpbench.geometry.outline import Line, Region
+from kpbench.printing.page import INK, MARKS, Page, Text, cut_contours, start_of
+
+SVG_FONTS = "Helvetica, Arial, sans-serif"
+
+
+def _mm(*values: float) -> str:
+    """Numbers to 1 nm, without trailing zeros."""
+    return " ".join(f"{round(v, 6) + 0.0:.6f}".rstrip("0").rstrip(".") for v in values)
+
+
+def _svg_path(region: Region) -> str:
+    """Path data. Arcs are at most 90 degrees: in longer ones the rounding of the ends moves the centre."""
+    data = []
+    for contour in cut_contours(region, 90.0):
+        data.append("M" + _mm(*start_of(contour[0])))
+        for part, after in zip(contour, contour[1:] + contour[:1], strict=True):
+            end = _mm(*start_of(after))
+            if isinstance(part, Line):
+                data.append(f"L{end}")
+            else:
+                data.append(f"A{_mm(part.radius, part.radius)} 0 0 {int(part.sweep_deg > 0)} {end}")
+        data.append("Z")
+    return "".join(data)
+
+
+def svg(page: Page) -> bytes:
+    """The page as SVG, in mm, with true arcs."""
+    size = f'width="{_mm(page.width)}mm" height="{_mm(page.height)}mm" viewBox="0 0 {_mm(page.width, page.height)}"'
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
+    lines.append(f"<title>{escape(Text(page.title, 0, 0, 0).clean)}</title>")
+    for layer in (INK, MARKS):
+        lines.append(f'<g id="{layer}" fill="#000" fill-rule="nonzero">')
+        lines += [f'<path d="{_svg_path(s.region)}"/>' for s in page.shapes if s.layer == layer]
+        lines.append("</g>")
+    lines.append(f'<g id="TEXT" font-family="{SVG_FONTS}">')
+    for t in page.texts:
+        place = f'transform="matrix(-1 0 0 1 {_mm(t.x, t.y)})"' if t.mirrored else f'x="{_mm(t.x)}" y="{_mm(t.y)}"'
+        lines.append(f'<text {place} font-size="{_mm(t.size)}" text-anchor="{t.anchor}">{escape(t.clean)}</text>')
+    return "\n".join([*lines, "</g>", "</svg>", ""]).encode()
