@@ -20,7 +20,7 @@ import torch
 import kpbench
 from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
-from kpbench.geometry.homography import resize
+from kpbench.images import resize
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import NetworkConfig
 

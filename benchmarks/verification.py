@@ -35,8 +35,8 @@ import kpbench
 from kpbench.detectors import verification as verify
 from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
+from kpbench.detectors.suppression import suppress
 from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
-from kpbench.geometry.homography import suppress
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0

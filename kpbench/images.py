@@ -169,3 +169,11 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
         for writer in video:
             writer.release()
         part.unlink(missing_ok=True)
+
+
+def resize(grey: UInt8, width: int, height: int) -> UInt8:
+    """The image in another size; the outer corners of its corner pixels stay where they are."""
+    if grey.shape == (height, width):
+        return grey
+    how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=how), np.uint8)

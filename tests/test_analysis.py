@@ -16,8 +16,8 @@ from kpbench.analysis import measures as analysis
 from kpbench.analysis import search
 from kpbench.analysis.cell_images import Grid, attitudes, images, seen_cells
 from kpbench.cli import main
+from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import coverage
-from kpbench.geometry.homography import Camera
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
 
 DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"

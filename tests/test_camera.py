@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from kpbench.errors import DataError
-from kpbench.geometry.homography import Camera, project, rotation_xyz
+from kpbench.geometry.camera import Camera, rotation_xyz
+from kpbench.geometry.homography import project
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.render.board_view import (

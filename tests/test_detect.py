@@ -5,8 +5,8 @@ import pytest
 
 from kpbench.detectors import prediction as pipeline
 from kpbench.detectors.interface import LoadedDetector, load_detector, to_grey
+from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
-from kpbench.geometry.homography import suppress
 from kpbench.types import Detections
 
 MODULE = """

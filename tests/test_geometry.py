@@ -3,7 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.geometry.homography import Camera, jacobian, plane_to_camera, project, projected_disc, rotation_xyz
+from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
+from kpbench.geometry.homography import jacobian, project, projected_disc
 
 angles = st.floats(-70, 70)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError
-from kpbench.geometry.homography import Camera
+from kpbench.geometry.camera import Camera
 from kpbench.report.figures import pose_table
 from kpbench.report.report import scores_file
 from kpbench.scoring.board_pose import PoseErrors, pose_errors, pose_groups

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from kpbench.detectors.interface import load_detector
-from kpbench.geometry.homography import Camera
+from kpbench.geometry.camera import Camera
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board

@@ -30,7 +30,8 @@ from kpbench.analysis.cell_images import (
     seen_cells,
     window_weights,
 )
-from kpbench.geometry.homography import Camera, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
+from kpbench.geometry.homography import projected_disc
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 

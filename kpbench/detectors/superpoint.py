@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from kpbench.detectors import verification as verify
 from kpbench.detectors.inference import on_gpu, open_session
 from kpbench.detectors.interface import to_grey
+from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
-from kpbench.geometry.homography import resize, suppress
+from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.types import Detections, Float, UInt8
 

@@ -25,10 +25,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.detectors.inference import Session, open_session
+from kpbench.detectors.suppression import suppress
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting import templates as match
 from kpbench.fitting.templates import Picture
-from kpbench.geometry.homography import suppress
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 from kpbench.workers import one_blas_thread

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from kpbench.errors import DataError
+from kpbench.geometry.camera import NO_DISTORTION, Camera, plane_to_camera, rotation_xyz
 from kpbench.geometry.coverage import Box, box_around, coverage
-from kpbench.geometry.homography import NO_DISTORTION, Camera, Ellipse, plane_to_camera, projected_disc, rotation_xyz
+from kpbench.geometry.homography import Ellipse, projected_disc
 from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import CameraBoard
 from kpbench.render.scene import Mask, Rendered, inside_image, measure_contrast

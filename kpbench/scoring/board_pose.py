@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.geometry.homography import Camera
+from kpbench.geometry.camera import Camera
 from kpbench.scoring.outcomes import Tally
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float

@@ -21,7 +21,7 @@ from kpbench.dataset import shard as store
 from kpbench.degrade import effects as degrade
 from kpbench.errors import DataError, DesignError
 from kpbench.files import read_toml, shipped_folder
-from kpbench.geometry.homography import Camera
+from kpbench.geometry.camera import Camera
 from kpbench.patches.board import CameraBoard, find_patch, hexagon_board, keys, number
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.degrade import effects as degrade
-from kpbench.geometry.homography import projected_discs, resize
+from kpbench.geometry.homography import projected_discs
+from kpbench.images import resize
 from kpbench.patches.design import Patch
 from kpbench.render.lookalikes import draw_lookalikes
 from kpbench.render.scene import Limits, Placement, paint, random_poses, rasterise

@@ -22,7 +22,7 @@ from kpbench.detectors.inference import open_session
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.geometry.homography import resize
+from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
 from kpbench.training.loop import network_of, read_checkpoint

@@ -1,0 +1,78 @@
+"""A pinhole camera with lens distortion, as OpenCV has it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from kpbench.types import Float
+
+
+def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:
+    """Rotation by z first, then y, then x about the fixed axes: ``Rx @ Ry @ Rz``, shape (3, 3)."""
+    (cx, cy, cz), (sx, sy, sz) = np.cos(a := np.radians([x_deg, y_deg, z_deg])), np.sin(a)
+    Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
+    Ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
+    Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
+    return np.asarray(Rx @ Ry @ Rz)
+
+
+def plane_to_camera(R_plane2camera: Float, t_camera: ArrayLike) -> Float:
+    """The 3x3 matrix ``[r1 r2 t]`` that takes (x, y, 1) on a plane to the camera frame."""
+    return np.column_stack([R_plane2camera[:, :2], np.asarray(t_camera, np.float64)])
+
+
+NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera: image size and focal length in px, principal point at the image's centre.
+
+    ``distortion`` holds OpenCV's (k1, k2, p1, p2, k3), radial and tangential (Brown 1966); 0 is a pinhole.
+    """
+
+    width_px: int
+    height_px: int
+    focal_px: float
+    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
+
+    @property
+    def K(self) -> Float:
+        """Intrinsic matrix, camera frame to px, ndarray of shape (3, 3)."""
+        cx, cy = (self.width_px - 1) / 2, (self.height_px - 1) / 2
+        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
+
+    def project(self, points_camera: ArrayLike) -> Float:
+        """Points of the camera frame, shape (N, 3), z > 0, to px with distortion, shape (N, 2)."""
+        points = np.asarray(points_camera, np.float64)
+        return self.distort(points[:, :2] / points[:, 2:])
+
+    def distort(self, rays: Float) -> Float:
+        """Points at distance 1 (x / z, y / z), shape (N, 2), to px, shape (N, 2)."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = np.asarray(rays, np.float64).T
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.asarray(self.focal_px * np.column_stack([xd, yd]) + self.K[:2, 2])
+
+    def local_K(self, ray: ArrayLike) -> Float:
+        """The intrinsic matrix that agrees with :meth:`distort` at one point (x / z, y / z) to first order.
+
+        Without distortion this is ``K`` everywhere.
+        """
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = np.asarray(ray, np.float64)
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # of the radial factor along x is x * slope
+        J = self.focal_px * np.array([
+            [radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, x * y * slope + 2 * p1 * x + 2 * p2 * y],
+            [x * y * slope + 2 * p1 * x + 2 * p2 * y, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x],
+        ])  # fmt: skip
+        at = self.distort(np.array([[x, y]]))[0]
+        return np.vstack([np.column_stack([J, at - J @ (x, y)]), [0.0, 0.0, 1.0]])
