@@ -17,7 +17,8 @@ import cv2
 import numpy as np
 
 from kpbench.render.board_view import Look, render_board
-from kpbench.synth.suite import Shot, SuiteConfig, load_suite
+from kpbench.synth.suite import Shot, SuiteConfig
+from kpbench.synth.suite_file import load_suite
 from kpbench.types import Float
 
 LENS = (-0.2, 0.05, 0.001, -0.0005, 0.01)

@@ -30,7 +30,9 @@ from tqdm import tqdm
 import kpbench
 from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector
-from kpbench.fitting import templates as match
+from kpbench.fitting.pyramid import Picture
+from kpbench.fitting.templates import VIEW_PX
+from kpbench.fitting.views import OCTAVES, surroundings
 from kpbench.workers import cores, one_thread
 
 NEAR, FAR = 0.6, 1.0
@@ -47,8 +49,8 @@ class Ellipse(nn.Module):
     def __init__(self, width: int = 32) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            *trunk(match.OCTAVES, width),
-            nn.Linear(3 * width * (match.VIEW_PX // 8) ** 2, 192),
+            *trunk(OCTAVES, width),
+            nn.Linear(3 * width * (VIEW_PX // 8) ** 2, 192),
             nn.ReLU(),
             nn.Linear(192, 6),
         )
@@ -103,7 +105,7 @@ def places(path: str, disturbed: bool, n: int) -> Places:
         angle = rng.uniform(0, 2 * np.pi)
         c, s = np.array([np.cos(angle), np.sin(angle)]) * 2 ** rng.uniform(-0.35, 0.35)
         turn[k] = [[c, -s], [s, c]]
-    around = match.surroundings(match.Picture(grey).smooth, at, turn).astype(np.float16)
+    around = surroundings(Picture(grey).smooth, at, turn).astype(np.float16)
     shift, log_map = np.zeros((len(at), 2)), np.zeros((len(at), 2, 2))
     back = np.linalg.inv(turn[on])
     log_map[on] = log_of_map(back @ affine(keypoints["H_patch2image"][which[on]]))

@@ -24,8 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
+from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate
-from kpbench.dataset.shard import open_dataset, sha256_of
+from kpbench.dataset.shard import sha256_of
 from kpbench.errors import DataError
 from kpbench.synth.synthetic import SynthConfig
 

@@ -20,10 +20,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from kpbench.degrade.effects import LADDER, apply, climb
+from kpbench.degrade.ladder import LADDER, apply, climb
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Placement, render_scene
-from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite
 from kpbench.types import Float, UInt8
 
 SIDE, RADIUS, BLACK, WHITE = 256, 45.0, 50, 200

@@ -15,8 +15,8 @@ from torch import nn
 from tqdm import tqdm
 
 from kpbench.detectors import verification as verify
-from kpbench.training.export import quantise
-from kpbench.training.network import unfold
+from kpbench.training.quantise import quantise
+from kpbench.training.weights import unfold
 
 BF16 = torch.cpu._is_avx512_bf16_supported()
 """Whether this processor computes in bfloat16, which then takes about half the time."""

@@ -36,7 +36,9 @@ from kpbench.detectors import verification as verify
 from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
 from kpbench.detectors.suppression import suppress
-from kpbench.fitting.templates import VIEW_PX, Picture, bank, short_axis
+from kpbench.fitting.align import short_axis
+from kpbench.fitting.pyramid import Picture
+from kpbench.fitting.templates import VIEW_PX, bank
 from kpbench.workers import cores, one_thread
 
 MORE = 1.0

@@ -22,7 +22,7 @@ _HOMES = {
     "generate": "dataset.generation",
     "load_detector": "detectors.interface",
     "load_patches": "patches.design",
-    "open_dataset": "dataset.shard",
+    "open_dataset": "dataset.folder",
     "predict": "detectors.prediction",
     "read_predictions": "predictions.files",
     "render_scene": "render.scene",

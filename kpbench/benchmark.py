@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from kpbench import __version__
-from kpbench.dataset import shard as store
+from kpbench.dataset.folder import MANIFEST, Dataset, open_dataset
 from kpbench.dataset.generation import generate
+from kpbench.dataset.shard import canonical_json
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import detect_some
 from kpbench.errors import DataError
@@ -52,7 +53,7 @@ class Benched:
     """
 
     config: SuiteConfig
-    dataset: store.Dataset
+    dataset: Dataset
     predictions: Path
     scores: Scores
     failures: tuple[tuple[int, str], ...]
@@ -110,8 +111,8 @@ def bench(
     labels = [detector.name for detector in loaded.values()]
     if len(set(labels)) < len(labels):
         raise DataError(f"two detectors share a name, among: {', '.join(labels)}")
-    datasets: dict[SuiteConfig, store.Dataset] = {}
-    runs: list[tuple[SuiteConfig, store.Dataset, Path]] = []
+    datasets: dict[SuiteConfig, Dataset] = {}
+    runs: list[tuple[SuiteConfig, Dataset, Path]] = []
     parts: list[_Part] = []
     for suite in suites:
         for name, detector in loaded.items():
@@ -135,12 +136,12 @@ def bench(
     return [_scored(*run) for run in runs]
 
 
-def _make(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> store.Dataset:
-    made_of = store.canonical_json([__version__, config.to_dict()]).encode()
+def _make(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
+    made_of = canonical_json([__version__, config.to_dict()]).encode()
     place = folder / f"{config.name}-{hashlib.sha256(made_of).hexdigest()[:8]}"
-    if (place / store.MANIFEST).exists():
+    if (place / MANIFEST).exists():
         progress(config.n)
-        return store.open_dataset(place)
+        return open_dataset(place)
     return generate(config, place, workers=workers, resume=True, progress=progress).dataset
 
 
@@ -156,7 +157,7 @@ def _forget(file: Path) -> None:
     shutil.rmtree(file.with_suffix(".parts"), ignore_errors=True)
 
 
-def _parts(dataset: store.Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:
+def _parts(dataset: Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:
     """The parts of a predictions file, in a folder beside it until all are there."""
     folder = file.with_suffix(".parts")
     try:
@@ -193,8 +194,8 @@ def _said(failures: list[list[Any]]) -> dict[str, Any]:
 
 
 @cache
-def _opened(path: Path) -> store.Dataset:
-    return store.open_dataset(path)
+def _opened(path: Path) -> Dataset:
+    return open_dataset(path)
 
 
 def _join(file: Path) -> None:
@@ -208,7 +209,7 @@ def _join(file: Path) -> None:
     shutil.rmtree(folder)
 
 
-def _scored(config: SuiteConfig, dataset: store.Dataset, file: Path) -> Benched:
+def _scored(config: SuiteConfig, dataset: Dataset, file: Path) -> Benched:
     predictions = read_predictions(file)
     failures = tuple((int(image_id), str(said)) for image_id, said in predictions.detector.get("failures", []))
     return Benched(config, dataset, file, score(dataset, predictions), failures)

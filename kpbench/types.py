@@ -18,6 +18,7 @@ from kpbench.errors import PredictionsError
 
 Int = NDArray[np.int64]
 Float = NDArray[np.float64]
+Float32 = NDArray[np.float32]
 UInt8 = NDArray[np.uint8]
 
 KEYPOINT_DTYPE = np.dtype(

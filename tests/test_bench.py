@@ -14,7 +14,8 @@ from kpbench.detectors import interface as detect
 from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
 from kpbench.predictions.files import read_predictions
-from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite
 
 SMALL = SuiteConfig(load_suite("paper-v1"), images=2, size_px=(203, 155), only=("blur",), shard_size=10)
 FEW = replace(SMALL, images=1)

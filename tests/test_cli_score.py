@@ -10,7 +10,8 @@ from click.testing import CliRunner
 
 from kpbench.cli import main
 from kpbench.dataset.export import export_dataset
-from kpbench.dataset.shard import Sample, ShardEntry, encode_shard, open_dataset, sha256_of, write_manifest
+from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.shard import Sample, encode_shard, sha256_of
 from kpbench.files import write_atomic
 from kpbench.predictions.files import Predictions, write_predictions
 from kpbench.scoring.metrics import COUNTS, METRICS

@@ -3,8 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.degrade import effects as degrade
-from kpbench.degrade.effects import blur, box_taps, dimming, line_kernel, motion_blur, noise, paper_mix, rain, shadow
+from kpbench.degrade.effects import blur, box_taps, dimming, line_kernel, motion_blur, noise
+from kpbench.degrade.ladder import FUNCTIONS, LADDER_MIX, apply, climb, ladder_mix, paper_mix
+from kpbench.degrade.weather import _transform, rain, shadow
 
 
 def picture(channels=1):
@@ -90,10 +91,10 @@ def test_the_paper_mix_records_what_it_did():
         result, effects = paper_mix(image, np.random.default_rng(seed))
         assert 1 <= len(effects) <= 3
         names = [entry["effect"] for entry in effects]
-        assert names == sorted(names, key=list(degrade.FUNCTIONS).index)
+        assert names == sorted(names, key=list(FUNCTIONS).index)
         seen.update(names)
         if "noise" not in names:
-            assert (degrade.apply(image, np.random.default_rng(0), effects) == result).all()
+            assert (apply(image, np.random.default_rng(0), effects) == result).all()
     assert seen == {"shadow", "rain", "motion_blur", "blur", "brightness", "noise"}
 
 
@@ -101,14 +102,14 @@ def test_the_ladder_mix_climbs_to_the_severest_rung_and_records_it():
     image, discs = picture(), np.array([[60.0, 50.0, 14.0]])
     levels: dict[str, list[float]] = {}
     for seed in range(400):
-        result, effects = degrade.ladder_mix(image, np.random.default_rng(seed), discs)
+        result, effects = ladder_mix(image, np.random.default_rng(seed), discs)
         assert result.shape == image.shape
         assert 1 <= len(effects) <= 2
         for entry in effects:
             levels.setdefault(entry["effect"], []).append(next(v for v in entry.values() if not isinstance(v, str)))
         if not {"noise", "low_light"} & {entry["effect"] for entry in effects}:
-            assert (degrade.apply(image, np.random.default_rng(0), effects) == result).all()
-    assert levels.keys() == {name.replace("-", "_").replace("rain", "rainfall") for name in degrade.LADDER_MIX}
+            assert (apply(image, np.random.default_rng(0), effects) == result).all()
+    assert levels.keys() == {name.replace("-", "_").replace("rain", "rainfall") for name in LADDER_MIX}
     for effect, severest in {"blur": 15, "noise": 60, "motion_blur": 30, "low_light": 9, "dimming": 40}.items():
         assert 0.7 * severest < max(levels[effect]) <= severest
         assert min(levels[effect]) < 0.3 * severest
@@ -118,11 +119,11 @@ def test_the_ladder_mix_climbs_to_the_severest_rung_and_records_it():
 def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch):
     import os
 
-    degrade._transform.cache_clear()
+    _transform.cache_clear()
     monkeypatch.delenv("NO_ALBUMENTATIONS_UPDATE", raising=False)
     shadow(picture(), 1)
     assert os.environ["NO_ALBUMENTATIONS_UPDATE"] == "1"
 
 
 def test_a_quality_between_two_is_recorded_as_the_one_applied():
-    assert degrade.climb(np.random.default_rng(0), "jpeg", 7.6, (20, 20))["quality"] == 8.0
+    assert climb(np.random.default_rng(0), "jpeg", 7.6, (20, 20))["quality"] == 8.0

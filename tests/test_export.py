@@ -10,10 +10,12 @@ import torch
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
-from kpbench.training.export import export, export_int8, fold, to_onnx
-from kpbench.training.loop import initial_weights, train
+from kpbench.training.export import export, fold, to_onnx
+from kpbench.training.loop import train
 from kpbench.training.network import SuperPoint
+from kpbench.training.quantise import export_int8
 from kpbench.training.recipe import NetworkConfig, Phase, Recipe
+from kpbench.training.weights import initial_weights
 
 SIZES = {"widths": (4, 4, 8, 8), "depths": (1, 2, 1, 1), "head_width": 8, "descriptor_width": 8}
 

@@ -14,12 +14,13 @@ import pytest
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.dataset import shard as store
+from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate, generate_part, merge
-from kpbench.degrade import effects as degrade
+from kpbench.dataset.shard import sha256_of
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, rasterise
+from kpbench.synth.finish import share_open
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.synth.user_pipeline import load_augmentation
 from kpbench.workers import dask_executor
@@ -40,7 +41,7 @@ def config(photos, **changes):
 
 
 def digests(folder):
-    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir())}
+    return {path.name: sha256_of(path) for path in sorted(folder.iterdir())}
 
 
 def test_neither_workers_nor_an_interruption_change_a_byte(photos, tmp_path):
@@ -113,9 +114,9 @@ def test_what_an_occlusion_hides_outside_the_image_counts_for_nothing(photos):
     placements = [Placement(shipped_patches()[0], np.array([[20.0, 0, 0], [0, 20, 60], [0, 0, 1]]), 0.0, 255.0)]
     masks = tuple(rasterise(placements))
     effects = [{"effect": "occlusion", "strips": [[-21.0, 60.0, 40.0, 100.0, 0.0, 90.0]]}]  # its end is at x = -1
-    assert degrade.share_open(sample.image, effects, masks)[0] == pytest.approx(1)
+    assert share_open(sample.image, effects, masks)[0] == pytest.approx(1)
     effects[0]["strips"][0][0] = 20.0
-    assert degrade.share_open(sample.image, effects, masks)[0] < 0.05
+    assert share_open(sample.image, effects, masks)[0] < 0.05
 
 
 def test_a_pipeline_keeps_what_an_occlusion_hid(photos, tmp_path):
@@ -184,7 +185,7 @@ def test_a_second_run_into_one_folder_is_refused(photos, tmp_path):
     finally:
         release.set()
         first.join()
-    assert len(store.open_dataset(tmp_path)) == 10
+    assert len(open_dataset(tmp_path)) == 10
 
 
 def test_a_disk_too_small_is_told_before_the_start(tmp_path):
@@ -287,7 +288,7 @@ def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
     for shards in (range(0, 1), range(1, 3)):
         generate_part(config(photos), url, shards, workers=1)
     assert merge(url).fingerprint == local.fingerprint
-    there = store.open_dataset(Path(url))  # as the command line has it
+    there = open_dataset(Path(url))  # as the command line has it
     assert (there.image(7) == local.image(7)).all()
     assert len(list(there.verify())) == 3
     for command in ("inspect", "preview", "verify"):

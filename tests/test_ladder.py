@@ -6,10 +6,22 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench.degrade import effects as degrade
-from kpbench.degrade.effects import LADDER, apply, climb
+from kpbench.degrade.effects import (
+    blur,
+    box_taps,
+    disc_kernel,
+    flare,
+    gaussian_taps,
+    line_kernel,
+    low_light,
+    noise,
+    occlusion,
+    shadow_edge,
+)
+from kpbench.degrade.ladder import FUNCTIONS, LADDER, apply, climb
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import coverage
+from kpbench.synth.finish import occlusion_cover
 
 RUNGS = [(effect, level) for effect, rungs in LADDER.items() for level in rungs.levels]
 BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")
@@ -66,9 +78,9 @@ def test_a_higher_rung_does_more(effect):
 
 @pytest.mark.parametrize(
     "kernel",
-    [degrade.disc_kernel(r) for r in (0.6, 2, 4, 7.3)]
-    + [np.outer(t, t) for t in (degrade.gaussian_taps(0.7), degrade.gaussian_taps(4.5), degrade.box_taps(6.4))]
-    + [degrade.line_kernel(length, angle) for length in (5, 10, 30) for angle in (0, 17.3, 90, 141)],
+    [disc_kernel(r) for r in (0.6, 2, 4, 7.3)]
+    + [np.outer(t, t) for t in (gaussian_taps(0.7), gaussian_taps(4.5), box_taps(6.4))]
+    + [line_kernel(length, angle) for length in (5, 10, 30) for angle in (0, 17.3, 90, 141)],
 )
 def test_every_kernel_is_centred_and_keeps_the_light(kernel):
     at = np.arange(len(kernel)) - len(kernel) // 2
@@ -78,7 +90,7 @@ def test_every_kernel_is_centred_and_keeps_the_light(kernel):
 
 
 def test_a_defocused_point_is_a_disc_of_its_radius():
-    kernel = degrade.disc_kernel(6.0)
+    kernel = disc_kernel(6.0)
     y, x = np.mgrid[: len(kernel), : len(kernel)] - len(kernel) // 2
     assert np.isclose(1 / kernel.max(), np.pi * 36, rtol=1e-3)
     assert (kernel[np.hypot(x, y) > 6.0 + 0.71] < 1e-12).all()
@@ -100,10 +112,10 @@ def test_no_effect_moves_a_patch(measure, effect):
 
 def test_the_measurement_sees_a_shift(measure, monkeypatch):
     monkeypatch.setitem(
-        degrade.FUNCTIONS,
+        FUNCTIONS,
         "blur",
         lambda image, kernel_px: cv2.warpAffine(
-            degrade.blur(image, kernel_px), np.array([[1, 0, 0.25], [0, 1, -0.125]]), image.shape[::-1], borderValue=200
+            blur(image, kernel_px), np.array([[1, 0, 0.25], [0, 1, -0.125]]), image.shape[::-1], borderValue=200
         ),
     )
     assert np.allclose(measure.shift("blur", 7, 0), (0.25, -0.125), atol=0.02)
@@ -117,13 +129,13 @@ def test_blur_is_as_wide_as_it_says(measure, effect, level):
 def test_noise_is_as_strong_as_it_says():
     flat = np.full((200, 200), 128, np.uint8)
     for sigma in (15, 30):
-        assert np.isclose(degrade.noise(flat, np.random.default_rng(0), sigma).std(), sigma, rtol=0.01)
+        assert np.isclose(noise(flat, np.random.default_rng(0), sigma).std(), sigma, rtol=0.01)
 
 
 @pytest.mark.parametrize("stops", [2, 4, 7])
 def test_low_light_has_the_noise_of_its_electrons(stops):
     grey = 128
-    got = degrade.low_light(np.full((300, 300), grey, np.uint8), np.random.default_rng(0), stops).astype(float)
+    got = low_light(np.full((300, 300), grey, np.uint8), np.random.default_rng(0), stops).astype(float)
     electrons = 10_000 * grey / 255 / 2**stops
     gain = min(16, 2**stops)
     step = 10_000 / 1023 / gain  # electrons a step of the converter
@@ -134,13 +146,13 @@ def test_low_light_has_the_noise_of_its_electrons(stops):
 
 def test_low_light_runs_out_of_grey_levels_once_the_gain_is_spent():
     ramp = np.tile(np.arange(256, dtype=np.uint8), (200, 1))
-    dark = degrade.low_light(ramp, np.random.default_rng(0), 12, full_well_e=1e9, read_noise_e=0)
+    dark = low_light(ramp, np.random.default_rng(0), 12, full_well_e=1e9, read_noise_e=0)
     assert len(np.unique(dark)) == 5  # 1023 x 16 / 2¹² is 3.996: 0 to 4
 
 
 def test_a_shadow_edge_takes_its_share_of_light_on_one_side():
     image = np.full((100, 100), 200, np.uint8)
-    got = degrade.shadow_edge(image, 50, 50, 0, 0.3, 4)
+    got = shadow_edge(image, 50, 50, 0, 0.3, 4)
     assert (got[:, :48] == 200).all()
     assert (got[:, 53:] == 60).all()
     assert got[10, 50] == 130
@@ -150,26 +162,26 @@ def test_a_shadow_edge_takes_its_share_of_light_on_one_side():
 def test_occlusion_hides_the_share_it_says(level):
     discs = np.array([[50.3, 60.1, 20.0], [130.0, 60.0, 12.5]])
     recorded = climb(np.random.default_rng(0), "occlusion", level, (180, 120), discs)
-    cover = degrade.occlusion_cover(recorded["strips"], (0, 0, 180, 120))
+    cover = occlusion_cover(recorded["strips"], (0, 0, 180, 120))
     angles = np.radians(np.arange(360))
     for x, y, radius in discs:
         rim = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
         disc = coverage([[rim]], [(0, 0, 180, 120)])[0]
         assert np.isclose((disc * cover).sum() / disc.sum(), level / 100, atol=0.01)
     image = np.full((120, 180), 255, np.uint8)
-    assert ((degrade.occlusion(image, recorded["strips"]) < 255) == (cover > 1 / 255)).mean() > 0.999
-    part = degrade.occlusion_cover(recorded["strips"], (40, 30, 50, 60))
+    assert ((occlusion(image, recorded["strips"]) < 255) == (cover > 1 / 255)).mean() > 0.999
+    part = occlusion_cover(recorded["strips"], (40, 30, 50, 60))
     assert np.allclose(part, cover[30:90, 40:90])
 
 
 def test_strips_beyond_the_image_change_nothing():
     image = picture(3)
-    assert (degrade.occlusion(image, [[-500.0, 20.0, 30.0, 10.0, 45.0, 0.0]]) == image).all()
+    assert (occlusion(image, [[-500.0, 20.0, 30.0, 10.0, 45.0, 0.0]]) == image).all()
 
 
 def test_flare_adds_light_and_takes_none():
     image = picture(1)
-    got = degrade.flare(image, 40, 30, 120, 25).astype(int)
+    got = flare(image, 40, 30, 120, 25).astype(int)
     assert (got >= image).all()
     assert abs(got[30, 40] - min(255, int(image[30, 40]) + 120)) <= 8  # a ghost may lie there
 

@@ -7,8 +7,10 @@ import torch
 from safetensors.torch import save_file
 
 from kpbench.errors import DataError
-from kpbench.training.network import SuperPoint, grow, initialise, losses, make_targets, read_weights
+from kpbench.training.losses import losses, make_targets
+from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Loss, NetworkConfig
+from kpbench.training.weights import grow, initialise, read_weights
 
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), head_width=8, descriptor_width=8)
 

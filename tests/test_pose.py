@@ -9,10 +9,11 @@ import pytest
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.report.figures import pose_table
-from kpbench.report.report import scores_file
+from kpbench.report.result_files import scores_file
 from kpbench.scoring.board_pose import PoseErrors, pose_errors, pose_groups
 from kpbench.scoring.scores import score
-from kpbench.synth.suite import SuiteConfig, board_in_view, load_suite
+from kpbench.synth.suite import SuiteConfig, board_in_view
+from kpbench.synth.suite_file import load_suite
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
 CAMERA = Camera(640, 480, 500.0, (0.02, -0.01, 0.0, 0.0, 0.0))

@@ -3,9 +3,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpbench.degrade import effects as degrade
+from kpbench.degrade.effects import blur, noise
 from kpbench.fitting import design_fit as refine
-from kpbench.fitting import templates as match
+from kpbench.fitting.pyramid import pyramid
 from kpbench.patches.design import shipped_patches
 from kpbench.render.background import procedural
 from kpbench.render.scene import Placement, render_scene
@@ -27,7 +27,7 @@ def picture(patch, A, xy, bend=(0.0, 0.0), size=90, background=120):
 
 
 def fit_one(image, xy, A, patch):
-    return refine.fit(match.pyramid(image, 0), np.array([xy]), np.array([A]), [patch])
+    return refine.fit(pyramid(image, 0), np.array([xy]), np.array([A]), [patch])
 
 
 @pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.name)
@@ -46,7 +46,7 @@ def test_a_clean_patch_is_fitted_exactly(patch):
 @pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.name)
 def test_no_blur_moves_the_centre_and_its_width_is_found(patch):
     xy, A = np.array([45.2, 44.6]), turn(10) @ np.diag([26.0, 20.0]) @ turn(140)
-    image = degrade.blur(picture(patch, A, xy), 7)
+    image = blur(picture(patch, A, xy), 7)
     fit = fit_one(image, xy + np.array([0.4, 0.3]), A, patch)
     assert np.hypot(*(fit.xy[0] - xy)) < 0.03
     assert fit.blur_px[0] == pytest.approx(2.0, abs=0.25)  # a box of 7 px: sqrt((49 - 1) / 12)
@@ -65,7 +65,7 @@ def test_the_error_is_near_the_bound_and_has_no_bias(number):
     patch, rng, errors = PATCHES[number], np.random.default_rng(number), []
     for _ in range(30):
         xy, A = 30 + rng.uniform(-0.5, 0.5, 2), 12.0 * turn(rng.uniform(0, 360))
-        image = degrade.noise(picture(patch, A, xy, size=60), rng, 10)
+        image = noise(picture(patch, A, xy, size=60), rng, 10)
         errors.append(fit_one(image, xy + rng.normal(0, 0.3, 2), A, patch).xy[0] - xy)
     assert np.sqrt(np.mean(np.square(errors))) < 0.038
     assert np.abs(np.mean(errors, axis=0)).max() < 0.02
@@ -87,14 +87,14 @@ def test_a_patch_at_the_border_is_fitted_on_what_is_there():
 
 def test_a_wide_surround_on_any_texture_keeps_the_model_before_the_camera():
     rng, wide = np.random.default_rng(1), replace(PATCHES[0], rim=0.5, quiet_zone=1.5)
-    levels = match.pyramid(procedural(rng, 320, 240), 0)
+    levels = pyramid(procedural(rng, 320, 240), 0)
     xy, scale, angle = rng.uniform(60, 180, (40, 2)), rng.uniform(20, 60, 40), rng.uniform(0, 360, 40)
     A = np.array([size * turn(deg) @ np.diag([1.0, 0.6]) for size, deg in zip(scale, angle, strict=True)])
     assert np.isfinite(refine.fit(levels, xy, A, [wide] * 40).xy).all()
 
 
 def test_where_there_is_no_patch_nothing_breaks():
-    flat = match.pyramid(np.full((40, 40), 100, np.uint8), 0)
+    flat = pyramid(np.full((40, 40), 100, np.uint8), 0)
     fit = refine.fit(flat, np.array([[20.0, 20.0], [-300.0, 5.0]]), np.array([np.eye(2) * 8] * 2), [PATCHES[0]] * 2)
     assert (fit.ncc < 0.1).all()
     none = refine.fit(flat, np.zeros((0, 2)), np.zeros((0, 2, 2)), [])

@@ -16,15 +16,8 @@ from kpbench.errors import DataError
 from kpbench.report import figures as exhibits
 from kpbench.report.charts import Series, bar_chart, line_chart, standalone
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
-from kpbench.report.report import (
-    Report,
-    scores_csv,
-    scores_file,
-    to_html,
-    to_latex_report,
-    to_markdown_report,
-    write_report,
-)
+from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report, write_report
+from kpbench.report.result_files import scores_csv, scores_file
 from kpbench.report.tables import Estimate, Table, to_csv, to_latex, to_markdown, to_plain
 from kpbench.report.worst_cases import worst_cases
 from kpbench.scoring.breakpoints import breakpoints

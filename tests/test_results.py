@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite
 
 ROOT = Path(__file__).parent.parent
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))

@@ -7,16 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench.dataset import shard as store
-from kpbench.dataset.shard import (
-    Sample,
-    ShardEntry,
-    encode_shard,
-    open_dataset,
-    open_shard,
-    sha256_of,
-    write_manifest,
-)
+from kpbench.dataset import folder
+from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.shard import Sample, encode_shard, open_shard, sha256_of
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.types import KEYPOINT_DTYPE
@@ -221,7 +214,7 @@ def test_a_missing_folder_says_how_to_make_one(tmp_path):
 
 
 def test_many_shards_need_few_open_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "MOST_OPEN", 2)
+    monkeypatch.setattr(folder, "MOST_OPEN", 2)
     data = open_dataset(write_dataset(tmp_path / "set", counts=(2, 2, 2, 2, 2)))
     assert data.truth.image_id.tolist() == list(range(10))
     expected = [sample for first in range(0, 10, 2) for sample in samples(2, first)]

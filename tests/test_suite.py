@@ -10,12 +10,14 @@ from click.testing import CliRunner
 
 import kpbench.synth.suite
 from kpbench.cli import main
-from kpbench.dataset import shard as store
 from kpbench.dataset.generation import generate
-from kpbench.degrade import effects as degrade
+from kpbench.dataset.shard import sha256_of
+from kpbench.degrade.effects import blur
+from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
 from kpbench.render.background import procedural
-from kpbench.synth.suite import SuiteConfig, load_suite, shipped_suites
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite, shipped_suites
 
 SMALL = (203, 155)
 
@@ -73,7 +75,7 @@ def test_one_scene_is_the_same_under_every_rung_and_patch():
         worn, _ = made.make(blurred[0] + (step * 4 + patch) * 2 + 1)
         clean, _ = made.make(pitch0 + patch * 2 + 1)
         assert worn.scene_id == clean.scene_id == 1
-        assert (degrade.blur(clean.image, (3, 7, 11, 15)[step]) == worn.image).all()
+        assert (blur(clean.image, (3, 7, 11, 15)[step]) == worn.image).all()
         for name in ("x", "y", "patch_id", "H_patch2image", "visible"):
             assert (worn.keypoints[name] == clean.keypoints[name]).all()
         assert (worn.keypoints["contrast"] < clean.keypoints["contrast"]).all()
@@ -139,7 +141,7 @@ def test_every_extended_condition_changes_the_image():
 
 
 def digests(folder):
-    return {path.name: store.sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
+    return {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 def test_interrupted_and_resumed_is_the_same(tmp_path):
@@ -264,9 +266,9 @@ def test_the_degrade_command(tmp_path):
     assert done.stderr == "kpbench: 1 images cannot be decoded, the others are done: broken.jpg\n"
     assert len(done.stdout.splitlines()) == 2
     got = cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED)
-    assert (got == degrade.blur(grey, 7)).all()
+    assert (got == blur(grey, 7)).all()
     got = cv2.imread(str(tmp_path / "out" / "deep" / "colour.png"), cv2.IMREAD_UNCHANGED)
-    assert (got == degrade.blur(colour, 7)).all()
+    assert (got == blur(colour, 7)).all()
     stack = ("--effect", "noise", "--level", 20, "--effect", "jpeg", "--level", 40)
     one = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "one")
     two = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "two")
@@ -307,7 +309,7 @@ def test_every_effect_needs_its_level():
 
 def test_the_help_names_every_effect():
     told = " ".join(run("degrade", "--help").stdout.split())
-    for effect in set(degrade.LADDER) - {"dimming-literal"}:
+    for effect in set(LADDER) - {"dimming-literal"}:
         assert effect in told
 
 

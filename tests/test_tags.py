@@ -8,7 +8,8 @@ from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.board_view import Look, board_keypoints, pose_board, render_board
-from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite
 
 CAMERA = Camera(640, 480, 350.3)
 BOARDS = [tag_board(name, 187.5) for name in TAG_BOARDS]

@@ -3,11 +3,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench.degrade import effects as degrade
+from kpbench.degrade.effects import blur, dimming, motion_blur, noise
 from kpbench.detectors.interface import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
-from kpbench.fitting import templates as match
+from kpbench.fitting.pyramid import pyramid, sample
 from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.render.background import procedural
 from kpbench.render.scene import Placement, render_scene
@@ -66,10 +66,10 @@ def test_it_finds_every_design_to_a_few_hundredths_of_a_pixel(rendered, detector
 @pytest.mark.parametrize(
     "effect",
     [
-        lambda image: degrade.noise(image, np.random.default_rng(0), 30),
-        lambda image: degrade.dimming(image, 40),
-        lambda image: degrade.blur(image, 5),
-        lambda image: degrade.motion_blur(image, 6.0, 30.0),
+        lambda image: noise(image, np.random.default_rng(0), 30),
+        lambda image: dimming(image, 40),
+        lambda image: blur(image, 5),
+        lambda image: motion_blur(image, 6.0, 30.0),
     ],
     ids=["noise", "dimming", "blur", "motion"],
 )
@@ -106,7 +106,7 @@ def test_a_patch_that_is_cut_by_the_image_is_found(detector):
 
 
 def test_the_threshold_only_drops_the_worse(rendered):
-    noisy = degrade.noise(rendered.image, np.random.default_rng(1), 45)
+    noisy = noise(rendered.image, np.random.default_rng(1), 45)
     every, some = TemplateDetector(threshold=0.0)(noisy), TemplateDetector(threshold=0.6)(noisy)
     assert len(every) > len(some) > 0
     assert (some.score >= 0.6).all()
@@ -146,9 +146,9 @@ def test_the_designs_are_not_written_into_the_code():
 
 
 def test_more_poses_than_remap_takes_at_once_are_sampled():
-    levels = match.pyramid(procedural(np.random.default_rng(0), 64, 48), 0)
+    levels = pyramid(procedural(np.random.default_rng(0), 64, 48), 0)
     xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
-    values = match.sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
+    values = sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
     assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()
 
 

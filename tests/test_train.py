@@ -18,8 +18,10 @@ from kpbench.files import PACKAGE
 from kpbench.patches.design import shipped_patches
 from kpbench.training import loop as training
 from kpbench.training.batches import Batch, SampleConfig
+from kpbench.training.checkpoint import network_of, read_checkpoint
 from kpbench.training.export import export
 from kpbench.training.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
+from kpbench.training.weights import initial_weights
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), down="stride", head_width=8, descriptor_width=8)
@@ -92,20 +94,20 @@ def test_shipped_weights_are_trained_on_from_what_they_find(tmp_path, run, head_
     said = []
     assert run(recipe, tmp_path, init="superpoint-small", say=said.append)
     assert said == [f"superpoint-small: {line}"]
-    content, tensors = training.read_checkpoint(tmp_path / "checkpoint.safetensors")
+    content, tensors = read_checkpoint(tmp_path / "checkpoint.safetensors")
     detector = SuperPointDetector(PACKAGE / "detectors" / "weights" / "superpoint-small.onnx")  # not in 8 bits
     images = np.random.default_rng(0).integers(0, 256, (2, 64, 72), np.uint8)
     with torch.inference_mode():
-        ours = training.network_of(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
+        ours = network_of(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
     for mine, theirs in zip(ours, detector.heads(list(images)), strict=True):
         assert np.abs(mine.numpy() - theirs).max() < 1e-3
 
 
 def test_other_designs_leave_out_the_id_head_of_an_exported_file():
-    weights, _ = training.initial_weights("superpoint-small", shipped_patches()[::-1])
+    weights, _ = initial_weights("superpoint-small", shipped_patches()[::-1])
     assert "descriptor_attached.weight" not in weights
     with pytest.raises(DataError, match="cannot be read as an ONNX model"):
-        training.initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
+        initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
 
 
 def test_a_checkpoint_is_trained_on_grown_and_for_other_designs_without_its_id_head(tmp_path, run):
@@ -127,7 +129,7 @@ def test_an_exported_file_whose_batchnorm_is_lost_is_refused(tmp_path, run):
     run(after, tmp_path)
     export(tmp_path / "checkpoint.safetensors", tmp_path / "a.onnx")
     with pytest.raises(DataError, match=r"a\.onnx: its BatchNorm, .* cannot be put back; start from its checkpoint"):
-        training.initial_weights(tmp_path / "a.onnx", shipped_patches())
+        initial_weights(tmp_path / "a.onnx", shipped_patches())
 
 
 def test_worker_processes_change_nothing(tmp_path, run):

@@ -23,11 +23,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench.geometry.coverage import box_around, coverage
 from kpbench.patches.design import Patch
-from kpbench.types import Float
+from kpbench.types import Float, Float32
 
 TILTS_DEG = (0.0, 30.0, 60.0)
 DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # of the tilt, in the image
@@ -36,8 +35,6 @@ SEEN_PX = 5.0
 BLUR = 0.2
 HALF = int(SEEN_PX) + 1  # of a window, px
 MARGIN = int(np.ceil(4 * BLUR * SEEN_PX))  # around it, for the blur
-
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

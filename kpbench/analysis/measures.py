@@ -21,7 +21,6 @@ from kpbench.analysis.cell_images import (
     SEEN_PX,
     TILTS_DEG,
     TURNS,
-    Float32,
     Grid,
     attitudes,
     blurred,
@@ -33,7 +32,7 @@ from kpbench.analysis.cell_images import (
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
 from kpbench.geometry.homography import projected_disc
 from kpbench.patches.design import Patch
-from kpbench.types import Float, UInt8
+from kpbench.types import Float, Float32, UInt8
 
 NOISE, CONTRAST = 10.0, 180.0  # grey levels
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.analysis.cell_images import Float32, Grid
+from kpbench.analysis.cell_images import Grid
 from kpbench.analysis.measures import (
     PAIR_STEPS,
     SIZES_PX,
@@ -33,7 +33,7 @@ from kpbench.analysis.measures import (
     pixels_needed,
 )
 from kpbench.patches.design import Patch, SemiCircle
-from kpbench.types import Float, UInt8
+from kpbench.types import Float, Float32, UInt8
 
 RADII = (1.0, 2 / 3, 1 / 2, 1 / 3)
 ANGLES_DEG = tuple(45.0 * n for n in range(8))

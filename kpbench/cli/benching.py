@@ -65,7 +65,8 @@ def bench(
     from kpbench.benchmark import bench as run_bench
     from kpbench.benchmark import images_to_do
     from kpbench.cli.progress import progress_bar
-    from kpbench.synth.suite import SuiteConfig, load_suite
+    from kpbench.synth.suite import SuiteConfig
+    from kpbench.synth.suite_file import load_suite
 
     if quick and (images or size):
         raise click.UsageError("--quick sets --images and --size; drop one of them")
@@ -95,7 +96,8 @@ def _report(out: Path, suite: str, runs: list[Benched]) -> None:
     from kpbench.files import write_atomic
     from kpbench.report.figures import breakpoint_table, overview_table, paper_table
     from kpbench.report.paper import PAPER
-    from kpbench.report.report import Report, provenance, scores_file, write_report
+    from kpbench.report.report import Report, write_report
+    from kpbench.report.result_files import provenance, scores_file
     from kpbench.report.tables import to_markdown
 
     scores = tuple(run.scores for run in runs)

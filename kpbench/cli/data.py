@@ -131,7 +131,7 @@ def inspect(dataset: Path) -> None:
       kpbench inspect kpbench-data
     """
     from kpbench.dataset.card import facts, histograms
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
     click.echo(f"{'dataset':12} {data.path}")
@@ -154,7 +154,7 @@ def verify(dataset: Path) -> None:
       kpbench verify kpbench-data
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "verify") as progress:
@@ -181,7 +181,7 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     import cv2
 
     from kpbench.dataset.card import overview
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
     from kpbench.files import write_atomic
 
     data = open_dataset(dataset)
@@ -204,7 +204,7 @@ def export(dataset: Path, form: str, out: Path | None) -> None:
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.export import export_dataset
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "export") as progress:

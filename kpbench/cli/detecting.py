@@ -82,7 +82,7 @@ def _run(
 ) -> Predicted:
     """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
     from kpbench.detectors.prediction import predict, predict_images
     from kpbench.images import open_images
 

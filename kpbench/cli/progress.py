@@ -10,8 +10,8 @@ from typing import Any
 
 import click
 
+from kpbench.dataset.folder import Dataset
 from kpbench.dataset.generation import Recipe, generate, generate_part
-from kpbench.dataset.shard import Dataset
 from kpbench.workers import Progress, dask_executor
 
 

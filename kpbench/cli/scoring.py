@@ -12,7 +12,7 @@ import click
 from kpbench.cli.options import Finite
 
 if TYPE_CHECKING:
-    from kpbench.dataset.shard import Dataset
+    from kpbench.dataset.folder import Dataset
     from kpbench.predictions.coco import CocoDataset
     from kpbench.report.tables import Table
     from kpbench.scoring.board_pose import PoseGroup
@@ -108,7 +108,7 @@ def score(
     """
     from kpbench.files import check_targets, write_atomic
     from kpbench.report.figures import pose_table
-    from kpbench.report.report import provenance, scores_csv, scores_file
+    from kpbench.report.result_files import provenance, scores_csv, scores_file
     from kpbench.report.tables import to_plain
     from kpbench.scoring.scores import check_gates
 
@@ -158,7 +158,7 @@ def compare(
     """
     from kpbench.files import check_targets, write_atomic
     from kpbench.report.figures import difference_table, verdict_table
-    from kpbench.report.report import comparison_file, provenance
+    from kpbench.report.result_files import comparison_file, provenance
     from kpbench.report.tables import to_plain
     from kpbench.scoring.comparison import check_regression
     from kpbench.scoring.comparison import compare as compare_scores
@@ -246,7 +246,7 @@ def _write_report(
 
 def _dataset_of(predictions: Predictions, preds: Path, gt: Path | None) -> Dataset | CocoDataset:
     """--gt, else the dataset that the file names, else ./kpbench-data."""
-    from kpbench.dataset.shard import open_dataset
+    from kpbench.dataset.folder import open_dataset
     from kpbench.errors import PredictionsError
     from kpbench.predictions.coco import open_coco
 

@@ -59,7 +59,8 @@ def suite(
       kpbench suite paper-v1 --board aruco
     """
     from kpbench.cli.progress import write_dataset
-    from kpbench.synth.suite import SuiteConfig, load_suite
+    from kpbench.synth.suite import SuiteConfig
+    from kpbench.synth.suite_file import load_suite
 
     config = SuiteConfig(load_suite(name), images, seed, size, only, backgrounds, distortion or (), board)
     write_dataset(config, out or Path("kpbench-suite") / config.name, "suite", **run)
@@ -93,7 +94,7 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     import json
 
     from kpbench.cli.progress import progress_bar
-    from kpbench.detectors.prediction import degrade_files
+    from kpbench.degrade.own_images import degrade_files
     from kpbench.errors import DataError
     from kpbench.images import check_apart, open_images
 

@@ -87,7 +87,8 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
       kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
     """
     try:
-        from kpbench.training.export import export, export_int8
+        from kpbench.training.export import export
+        from kpbench.training.quantise import export_int8
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench export-model {INSTALL} ({error})") from None
     from kpbench.errors import DataError

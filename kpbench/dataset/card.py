@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
-from kpbench.dataset.shard import Dataset
+from kpbench.dataset.folder import Dataset
 from kpbench.files import write_atomic
 from kpbench.types import Float, UInt8
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.dataset.card import names, write_card
-from kpbench.dataset.shard import Dataset
+from kpbench.dataset.folder import Dataset
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.types import KEYPOINT_DTYPE, UInt8

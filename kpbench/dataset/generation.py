@@ -14,7 +14,6 @@ import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from functools import cache, partial
@@ -23,12 +22,20 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from kpbench.dataset import card
-from kpbench.dataset import shard as store
+from kpbench.dataset.folder import MANIFEST, Dataset, ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.resume import (
+    Piece,
+    Result,
+    keep_shards,
+    lock_folder,
+    naming_folder,
+    read_head,
+    telling_how_to_resume,
+)
+from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
 from kpbench.workers import Progress, run_pieces
-
-LOCK = ".kpbench.lock"
 
 
 class Recipe(Protocol):
@@ -57,7 +64,7 @@ class Recipe(Protocol):
         """The base scene of an image; shards are made scene by scene, as what a scene needs is kept."""
         ...
 
-    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
+    def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         """One image, and the broken background files met on the way."""
         ...
 
@@ -68,15 +75,9 @@ class Recipe(Protocol):
 class Run:
     """What :func:`generate` did: the dataset, the broken background files, and the number of images that were kept."""
 
-    dataset: store.Dataset
+    dataset: Dataset
     broken: tuple[str, ...]
     kept: int
-
-
-Piece = tuple[str, int, int]
-"""(file, first image, number of images) of a shard."""
-Result = tuple[store.ShardEntry, tuple[str, ...]]
-"""A finished shard, and the background files that could not be decoded for it."""
 
 
 def generate(
@@ -111,7 +112,7 @@ def generate(
     """
     folder, written = _made(out), config.to_dict()  # lists the backgrounds, before anything is touched
     plan = _plan(config.n, config.shard_size)
-    with _locked(folder):
+    with lock_folder(folder):
         kept = _prepare(folder, written, plan, resume, overwrite)
         results = _complete(config, folder, written, plan, kept, workers, executor, progress)
         dataset, broken = _finish(folder, written, [results[name] for name, _, _ in plan])
@@ -149,13 +150,13 @@ def generate_part(
         asked = f"{shards.start}:{shards.stop}"
         raise DataError(f"--shard-range is {asked}, expected A:B with 0 <= A < B <= {len(plan)}, the number of shards")
     part = plan[shards.start : shards.stop]
-    with _locked(folder, shared=True):
+    with lock_folder(folder, shared=True):
         kept = _prepare(folder, written, part, resume, overwrite)
         results = _complete(config, folder, written, part, kept, workers, executor, progress)
     return sum(entry.count for entry, _ in results.values())
 
 
-def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> store.Dataset:
+def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     """Make one dataset of shards that were made in parts: check that all are there, write the manifest.
 
     Parameters
@@ -169,7 +170,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> store.Dataset:
         If a shard is missing, damaged, or of another dataset than the first.
     """
     folder = _made(out)
-    with _locked(folder):
+    with lock_folder(folder):
         for part in map(folder_at, parts):
             for path in sorted(part.glob("shard-*.h5")):
                 if not (folder / path.name).exists():
@@ -177,12 +178,12 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> store.Dataset:
         present = sorted(folder.glob("shard-*.h5"))
         if not present:
             raise DataError(f"{folder}: no shards there; name the folders of the parts")
-        written = json.loads(_head(present[0])[0])
+        written = json.loads(read_head(present[0])[0])
         plan = _plan(written["n"], written["shard_size"])
         missing = [n for n, (name, _, _) in enumerate(plan) if not (folder / name).exists()]
         if missing:
             raise DataError(f"{folder}: {len(missing)} of {len(plan)} shards are missing, first is number {missing[0]}")
-        kept = _keep(folder, written, plan)
+        kept = keep_shards(folder, written, plan)
         return _finish(folder, written, [kept[name] for name, _, _ in plan])[0]
 
 
@@ -212,7 +213,7 @@ def _prepare(
     folder: Path, written: dict[str, Any], plan: list[Piece], resume: bool, overwrite: bool
 ) -> dict[str, Result]:
     """Look at what the folder holds; return the finished shards of the plan that this run can keep."""
-    manifest = folder / store.MANIFEST
+    manifest = folder / MANIFEST
     there = [path for path in folder.glob("*") if not path.name.startswith(".")]
     present = [path for path in there if fnmatch(path.name, "shard-*.h5")]
     names = {name for name, _, _ in plan}
@@ -236,47 +237,7 @@ def _prepare(
     for path in present:
         if path.name not in names:
             raise DataError(f"{path}: of another dataset than this command makes; use --overwrite or another --out")
-    return _keep(folder, written, plan)
-
-
-def _keep(folder: Path, written: dict[str, Any], plan: list[Piece]) -> dict[str, Result]:
-    """Those shards of a plan that are there, after a look into each; if the dataset was finished, byte by byte."""
-    known = store.recorded_digests(folder)
-    kept: dict[str, Result] = {}
-    for name, first, count in plan:
-        path = folder / name
-        if path.exists():
-            config, broken, images = _head(path)
-            if config != store.canonical_json(written) or images != range(first, first + count):
-                why = _difference(json.loads(config), written)
-                raise DataError(
-                    f"{path}: of another dataset than this command makes{why}; use --overwrite or another --out"
-                )
-            entry = store.ShardEntry(name, first, count, path.stat().st_size, store.sha256_of(path))
-            if known.get(name, entry.sha256) != entry.sha256:
-                raise DataError(f"{path}: damaged since it was written; delete it, and --resume makes it again")
-            kept[name] = (entry, broken)
-    return kept
-
-
-def _head(path: Path) -> tuple[str, tuple[str, ...], range]:
-    """A shard's config as text, its broken backgrounds, and which images it holds."""
-    with store.open_shard(path) as file:
-        ids = file["image_id"][:]
-        broken = tuple(json.loads(store.attribute(file, "broken_backgrounds")))
-        return store.attribute(file, "config"), broken, range(int(ids[0]), int(ids[-1]) + 1)
-
-
-def _difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """The first option in which two configs differ, for people; of a table, the first entry."""
-    for key in here:
-        if there.get(key) != here[key]:
-            if isinstance(there.get(key), dict) and isinstance(here[key], dict):
-                return _difference(there[key], here[key])
-            values = [str(config.get(key)) for config in (there, here)]
-            said = f" is {values[0]} there, {values[1]} here" if max(map(len, values)) < 40 else " differs"
-            return f" ({key}{said})"
-    return ""
+    return keep_shards(folder, written, plan)
 
 
 def _complete(
@@ -295,39 +256,18 @@ def _complete(
     progress(sum(entry.count for entry, _ in kept.values()))
     results = dict(kept)
     work = partial(_write_shard, config, written, folder.resolve())
-    with _resumable(folder):
+    with telling_how_to_resume(folder):
         for entry, met in run_pieces(work, todo, workers, progress, executor):
             results[entry.file] = (entry, met)
     return results
 
 
-@contextmanager
-def _named(folder: Path) -> Iterator[None]:
-    """Let errors name the folder as the user does."""
-    try:
-        yield
-    except DataError as error:
-        said = str(error).replace(str(folder.resolve()), str(folder))
-        raise DataError(said if said.startswith(str(folder)) else f"{folder}: {said}") from None
-
-
-@contextmanager
-def _resumable(folder: Path) -> Iterator[None]:
-    """Let errors say how to go on, too, where something is there to go on from."""
-    try:
-        with _named(folder):
-            yield
-    except DataError as error:
-        kept = "; finished shards are kept, add --resume to go on" if any(folder.glob("shard-*.h5")) else ""
-        raise DataError(f"{error}{kept}") from None
-
-
-def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[store.Dataset, tuple[str, ...]]:
+def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[Dataset, tuple[str, ...]]:
     """Write the manifest, which makes the folder a dataset, and its card."""
     broken = tuple(sorted({file for _, files in results for file in files}))
-    with _named(folder):
-        store.write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
-        dataset = store.open_dataset(folder)
+    with naming_folder(folder):
+        write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
+        dataset = open_dataset(folder)
         card.write_card(dataset, folder)
     return dataset, broken
 
@@ -351,39 +291,6 @@ def _size(count: float) -> str:
     return f"{count:.3g} {unit}"
 
 
-@contextmanager
-def _locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold the folder against another run; the lock ends with the process, however that ends.
-
-    Runs of a part of the shards share it with each other.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows has no flock; there the check is left out
-        yield
-        return
-    if not is_local(folder):  # nor has an object store
-        yield
-        return
-    path = folder / LOCK
-    try:
-        file = path.open("w")
-    except OSError as error:
-        raise DataError(f"{path}: cannot be written, {error.strerror}") from None
-    with file:
-        try:
-            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # unlinked between open and lock
-                raise OSError
-        except OSError:
-            raise DataError(f"{folder}: another kpbench run is writing to it") from None
-        try:
-            yield
-        finally:
-            if not shared:
-                path.unlink(missing_ok=True)
-
-
 def _provenance(broken: tuple[str, ...]) -> dict[str, Any]:
     """Versions that can change pixels, and the broken files; nothing that differs between equal runs."""
     libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "deflate")
@@ -403,7 +310,7 @@ def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: P
     name, first, count = piece
     met: set[str] = set()
 
-    def made() -> Iterator[store.Sample]:
+    def made() -> Iterator[Sample]:
         ours = _of_this_process(config)
         for index in range(first, first + count):
             sample, failed = ours.make(index)
@@ -412,9 +319,9 @@ def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: P
             progress(1)
 
     with _turn:  # an executor may have several threads a process; caches and albumentations' generators are not theirs
-        data = store.encode_shard(made(), count, written, met)
+        data = encode_shard(made(), count, written, met)
     write_atomic(folder / name, data)
-    return store.ShardEntry(name, first, count, len(data), hashlib.sha256(data).hexdigest()), tuple(sorted(met))
+    return ShardEntry(name, first, count, len(data), hashlib.sha256(data).hexdigest()), tuple(sorted(met))
 
 
 @cache

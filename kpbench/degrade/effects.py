@@ -9,18 +9,13 @@ An effect is recorded as a dict, its name under "effect" and the arguments of it
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from kpbench.errors import DataError
-from kpbench.geometry.coverage import Box, box_around, coverage
-from kpbench.render.scene import Mask, inside_image
+from kpbench.geometry.coverage import box_around, coverage
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -102,50 +97,6 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
     kernel = line_kernel(length_px, angle_deg)
     spread = cv2.filter2D(image.astype(np.float32), -1, kernel, borderType=BORDER)  # half the time of 8 bits
     return np.asarray(cv2.add(spread, np.zeros(1), dtype=cv2.CV_8U), np.uint8)
-
-
-def albumentations() -> Any:
-    """The library, imported late: it is slow to import, and would look on the network for news of itself."""
-    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
-    import albumentations as library
-
-    return library
-
-
-@lru_cache(maxsize=8)
-def _transform(name: str) -> Any:
-    # RandomShadow's own region of interest is the lower half of a road scene; here it is the image
-    options = {"shadow_roi": (0, 0, 1, 1)} if name == "RandomShadow" else {}
-    return getattr(albumentations(), name)(p=1.0, **options)
-
-
-def _drawn(name: str, image: UInt8, seed: int) -> tuple[Any, dict[str, Any]]:
-    """A transform of the library, and what it draws for an image from a seed."""
-    transform = _transform(name)
-    transform.set_random_seed(seed)
-    return transform, transform.get_params_dependent_on_data({"shape": image.shape}, {})
-
-
-def shadow(image: UInt8, seed: int) -> UInt8:
-    """One or two dark polygons at half the brightness, as ``albumentations.RandomShadow`` draws them."""
-    _, drawn = _drawn("RandomShadow", image, seed)
-    result = image.copy()
-    for corners, intensity in zip(drawn["vertices_list"], drawn["intensities"], strict=True):
-        mask = cv2.fillPoly(np.zeros(image.shape[:2], np.uint8), [corners], 255)
-        cv2.copyTo(brightness(result, 1 - float(intensity)), mask, result)
-    return result
-
-
-def rain(image: UInt8, seed: int) -> UInt8:
-    """Bright streaks over a dimmed image, as ``albumentations.RandomRain`` draws them; it asks for three channels."""
-    transform, drawn = _drawn("RandomRain", image, seed)
-    start = drawn["rain_drops"]
-    lines = np.stack([start, start + np.array([drawn["slant"], drawn["drop_length"]])], axis=1).astype(np.int32)
-    layer = np.zeros_like(image)
-    cv2.polylines(layer, list(lines), False, transform.drop_color, transform.drop_width, cv2.LINE_4)
-    reach = (transform.blur_value, transform.blur_value)
-    lit = cv2.add(image, cv2.blur(layer, reach))
-    return np.asarray(cv2.multiply(lit, transform.brightness_coefficient, dtype=cv2.CV_8U), np.uint8)
 
 
 @lru_cache(maxsize=64)
@@ -278,31 +229,6 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
     return result
 
 
-def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
-    """Fraction of each pixel of a box that :func:`occlusion` hides, shape (height, width)."""
-    x, y, w, h = box
-    seen = np.ones((h, w))
-    for polygon in _strips(strips):
-        around = box_around([polygon])
-        shifted = (around[0] - x, around[1] - y, *around[2:])
-        there, here = inside_image(shifted, seen)
-        if seen[there].size:
-            seen[there] *= 1 - coverage([[polygon]], [around])[0][here]
-    return 1 - seen
-
-
-def share_open(image: UInt8, effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
-    """The fraction of what is in the image of each patch (n,) that the occlusions among these effects leave open."""
-    strips = [effect["strips"] for effect in effects if effect["effect"] == "occlusion"]
-    share = np.ones(len(masks))
-    for n, mask in enumerate(masks) if strips else ():
-        open_ = disc = mask.disc[inside_image(mask.box, image)[1]]
-        for one in strips:
-            open_ = open_ * (1 - occlusion_cover(one, mask.box))[inside_image(mask.box, image)[1]]
-        share[n] = open_.sum() / max(disc.sum(), 1e-9)
-    return share
-
-
 def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) -> UInt8:
     """A lamp at (x, y) in the lens: a glow of ``strength`` grey levels that falls off with the distance, and ghosts.
 
@@ -316,210 +242,3 @@ def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) ->
         radius = np.float32(size * reach_px)
         glow += np.float32(share * strength) * np.clip((radius - np.sqrt(dx * dx + dy * dy)) / 4 + 0.5, 0, 1)
     return _uint8(image + _across(glow, image))
-
-
-# --- the ladder ---------------------------------------------------------------------------------------------------
-
-Discs = Float
-"""Patches in an image that an effect may aim at, shape (n, 3): x, y and radius in px."""
-
-
-Draw = Callable[[np.random.Generator, float, tuple[int, int], Discs], Effect]
-
-
-@dataclass(frozen=True)
-class Rungs:
-    """One effect of the ladder: its levels from mild to severe, their unit, and the least and most it takes.
-
-    ``draw(rng, level, (width_px, height_px), discs)`` gives the effect as a dict; what is not set by the
-    level (an angle, a place) is drawn.
-    """
-
-    levels: tuple[float, ...]
-    unit: str
-    bounds: tuple[float, float]
-    draw: Draw
-
-
-def _seed(rng: np.random.Generator) -> int:
-    return int(rng.integers(2**31))
-
-
-def _angle(rng: np.random.Generator, end: float) -> float:
-    return round(float(rng.uniform(0, end)), 1)
-
-
-def _draw_motion_blur(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    return {"effect": "motion_blur", "length_px": level, "angle_deg": _angle(rng, 180)}
-
-
-def _draw_shadow_edge(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """Across one of the patches, off its centre by up to half its radius."""
-    x, y, radius = discs[int(rng.integers(len(discs)))]
-    x, y = (x, y) + radius * rng.uniform(-0.5, 0.5, 2)
-    where = {"x": round(float(x), 2), "y": round(float(y), 2), "angle_deg": _angle(rng, 360)}
-    return {"effect": "shadow_edge", **where, "light": round(1 - level / 100, 6), "penumbra_px": round(radius / 8, 2)}
-
-
-def _draw_occlusion(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """A strip from a random side over every patch, so that ``level`` percent of its circle is hidden."""
-    reach = np.linspace(1, -1, 2001)
-    hidden = (np.arccos(reach) - reach * np.sqrt(1 - reach**2)) / np.pi  # share of a unit disc beyond x = reach
-    start = float(np.interp(level / 100, hidden, reach))
-    strips = []
-    for x, y, radius in discs:
-        angle_deg, grey = _angle(rng, 360), float(rng.integers(20, 236))
-        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-        length, middle = (1.3 - start) * radius, (1.3 + start) / 2 * radius
-        strip = (x + c * middle, y + s * middle, length, 2.6 * radius)
-        strips.append([*(round(float(v), 3) for v in strip), angle_deg, grey])
-    return {"effect": "occlusion", "strips": strips}
-
-
-def _draw_flare(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """The lamp stands one to four radii beside one of the patches."""
-    x, y, radius = discs[int(rng.integers(len(discs)))]
-    angle, away = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
-    where = {"x": round(float(x + away * np.cos(angle)), 2), "y": round(float(y + away * np.sin(angle)), 2)}
-    return {"effect": "flare", **where, "strength": level, "reach_px": round(0.15 * size[0], 2)}
-
-
-def _draw_rainfall(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    fixed = {"streaks": round(level * size[0] * size[1] / 1e6), "length_px": round(0.04 * size[0], 2)}
-    return {"effect": "rainfall", "seed": _seed(rng), **fixed, "slant_deg": round(float(rng.uniform(-20, 20)), 1)}
-
-
-def _set(effect: str, parameter: str, **fixed: Any) -> Draw:
-    """An effect that a level sets wholly."""
-    return lambda rng, level, size, discs: {"effect": effect, parameter: level, **fixed}
-
-
-def _draw_jpeg(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    return {"effect": "jpeg", "quality": float(round(level))}
-
-
-LADDER: dict[str, Rungs] = {
-    "blur": Rungs((3, 7, 11, 15), "px", (1, 501), _set("blur", "kernel_px")),
-    "dimming": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k")),
-    "dimming-literal": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k", law="literal")),
-    "noise": Rungs((15, 30, 45, 60), "grey levels", (0, 1000), _set("noise", "sigma")),
-    "gaussian-blur": Rungs((1, 2, 3, 4.5), "px", (0.1, 100), _set("gaussian_blur", "sigma_px")),
-    "motion-blur": Rungs((5, 10, 20, 30), "px", (0.1, 500), _draw_motion_blur),
-    "defocus": Rungs((2, 4, 6, 9), "px", (0.1, 250), _set("defocus", "radius_px")),
-    "shadow-edge": Rungs((30, 50, 70, 90), "% of the light", (0, 100), _draw_shadow_edge),
-    "rain": Rungs((500, 1000, 2000, 4000), "streaks a megapixel", (0, 1e5), _draw_rainfall),
-    "jpeg": Rungs((50, 25, 10, 5), "quality", (1, 100), _draw_jpeg),
-    "low-light": Rungs((4, 6, 8, 9), "stops", (0, 14), _set("low_light", "stops")),
-    "occlusion": Rungs((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
-    "flare": Rungs((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),
-}
-"""Effect → its rungs. Stacks are effects applied one after the other."""
-
-
-def climb(
-    rng: np.random.Generator, effect: str, level: float, size_px: tuple[int, int], discs: Discs | None = None
-) -> Effect:
-    """Draw what a level leaves open; the result goes into :func:`apply`.
-
-    Parameters
-    ----------
-    rng
-    effect : a key of :data:`LADDER`.
-    level : any number in the effect's unit, not only one of its rungs.
-    size_px : (width, height) of the image.
-    discs : ndarray of shape (n, 3), optional
-        x, y and radius of the patches that shadow edge, occlusion and flare aim at; one random place if left out.
-
-    Raises
-    ------
-    DataError
-        If there is no such effect, or the level makes no sense for it.
-    """
-    if effect not in LADDER:
-        raise DataError(f"there is no effect {effect!r}, only: {', '.join(LADDER)}")
-    rungs = LADDER[effect]
-    low, high = rungs.bounds
-    if not low <= level <= high:
-        raise DataError(f"{effect} takes a level from {low:g} to {high:g} ({rungs.unit}), not {level:g}")
-    if discs is None or not len(discs):
-        width, height = size_px
-        discs = np.array([[rng.uniform(0.2, 0.8) * width, rng.uniform(0.2, 0.8) * height, 0.05 * width]])
-    return rungs.draw(rng, level, size_px, discs)
-
-
-def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[str, Any]]]:
-    """The paper's deteriorations (§2.2): one to three of six, drawn without repetition.
-
-    The paper gives no strengths; these follow the defaults of the library that it used, and the order
-    is that of light and camera: shadow, rain, motion blur, blur, brightness, noise.
-
-    Returns
-    -------
-    image : ndarray of the same shape, uint8
-    effects : list of dict
-        What was applied, in order, with the parameters that were drawn.
-    """
-    drawn: dict[str, dict[str, Any]] = {
-        "shadow": {"seed": int(rng.integers(2**31))},
-        "rain": {"seed": int(rng.integers(2**31))},
-        "motion_blur": {"length_px": int(rng.integers(3, 10)), "angle_deg": int(rng.integers(180))},
-        "blur": {"kernel_px": int(rng.choice([3, 5, 7]))},
-        "brightness": {"factor": round(rng.uniform(0.5, 1.3), 3)},
-        "noise": {"sigma": round(rng.uniform(5, 30), 2)},
-    }
-    chosen = rng.permutation(len(drawn))[: rng.integers(1, 4)]
-    effects = [{"effect": name, **drawn[name]} for n, name in enumerate(drawn) if n in chosen]
-    return apply(image, rng, effects), effects
-
-
-LADDER_MIX = (
-    "occlusion", "rain", "shadow-edge", "dimming", "flare", "motion-blur", "defocus", "gaussian-blur", "blur",
-    "low-light", "noise", "jpeg",
-)  # fmt: skip
-"""What :func:`ladder_mix` draws from, in the order of scene, light, lens, sensor and file."""
-
-
-def ladder_mix(image: UInt8, rng: np.random.Generator, discs: Discs) -> tuple[UInt8, list[Effect]]:
-    """One or two effects of the ladder, at levels from nothing to their severest rung, uniform.
-
-    Parameters and returns as for :func:`paper_mix`; ``discs`` as for :func:`climb`.
-    """
-    size_px = (image.shape[1], image.shape[0])
-    chosen = rng.permutation(len(LADDER_MIX))[: rng.integers(1, 3)]
-    effects = []
-    for name in (LADDER_MIX[n] for n in sorted(chosen)):
-        rungs = LADDER[name]
-        mildest = rungs.bounds[rungs.levels[0] > rungs.levels[-1]]
-        level = round(mildest + float(rng.random()) * (rungs.levels[-1] - mildest), 0 if name == "jpeg" else 2)
-        effects.append(climb(rng, name, level, size_px, discs))
-    return apply(image, rng, effects), effects
-
-
-FUNCTIONS: dict[str, Callable[..., UInt8]] = {
-    "shadow": shadow,
-    "rain": rain,
-    "motion_blur": motion_blur,
-    "blur": blur,
-    "brightness": brightness,
-    "dimming": dimming,
-    "noise": noise,
-    "gaussian_blur": gaussian_blur,
-    "defocus": defocus,
-    "shadow_edge": shadow_edge,
-    "rainfall": rainfall,
-    "jpeg": jpeg,
-    "low_light": low_light,
-    "occlusion": occlusion,
-    "flare": flare,
-}
-DRAWS_A_FIELD = ("noise", "low_light")
-
-
-def apply(image: UInt8, rng: np.random.Generator, effects: list[Effect]) -> UInt8:
-    """Apply recorded effects in order; noise and low light take their fields from ``rng``."""
-    for entry in effects:
-        parameters = {key: value for key, value in entry.items() if key != "effect"}
-        if entry["effect"] in DRAWS_A_FIELD:
-            parameters["rng"] = rng
-        image = FUNCTIONS[entry["effect"]](image, **parameters)
-    return image

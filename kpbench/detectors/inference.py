@@ -9,11 +9,9 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-
-Float32 = NDArray[np.float32]
+from kpbench.types import Float32
 
 
 class Session(Protocol):

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import traceback
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset import shard as store
 from kpbench.dataset.drawing import draw_detections
-from kpbench.degrade import effects as degrade
+from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
-from kpbench.files import PACKAGE, write_atomic
+from kpbench.files import PACKAGE
 from kpbench.images import Source, image_writer
-from kpbench.render.scene import stream
 from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_pieces
 
@@ -41,7 +36,7 @@ Found = tuple[Detections, str]
 
 
 def predict(
-    dataset: store.Dataset,
+    dataset: Dataset,
     detector: str | LoadedDetector,
     *,
     threshold: float | None = None,
@@ -116,7 +111,7 @@ def _predicted(
     found: list[Found],
     labels: list[str],
     ids: NDArray[np.int64],
-    dataset: store.Dataset | None = None,
+    dataset: Dataset | None = None,
 ) -> Predicted:
     if found and all(said for _, said in found):
         raise DataError(
@@ -153,7 +148,7 @@ def _loaded(name: str, threshold: float | None) -> LoadedDetector:
 
 
 def detect_some(
-    dataset: store.Dataset, detector: str | LoadedDetector, threshold: float | None, piece: range, progress: Progress
+    dataset: Dataset, detector: str | LoadedDetector, threshold: float | None, piece: range, progress: Progress
 ) -> dict[int, Found]:
     """What a detector finds in some images of a dataset, and the message of each on which it raised, else "".
 
@@ -170,48 +165,3 @@ def detect_some(
         results[n] = _detect(loaded, dataset.image(n), threshold)
         progress(1)
     return results
-
-
-def degrade_files(
-    source: Source, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
-) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
-    """Degrade images one by one and write them as PNG under their own names, with the folders they are in.
-
-    Parameters
-    ----------
-    source : from :func:`kpbench.images.open_images`; what cannot be decoded is named at the end.
-    out : folder, made if it is not there; not the one that the images are in.
-    steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
-    seed : the n-th image written is a function of the n-th image, the steps, the seed and n.
-
-    Yields
-    ------
-    path : the file that was written.
-    effects : what was applied, see :func:`kpbench.degrade.climb`.
-
-    Raises
-    ------
-    DataError
-        If an effect is not known, a level is out of range, a file cannot be written, or, after all others
-        are done, if images could not be decoded.
-    """
-    broken = []
-    for n, (name, image) in enumerate(source.images):
-        if image is None:
-            broken.append(name)
-            continue
-        if (image == image[..., :1]).all():  # grey, whatever the file's mode
-            image = np.ascontiguousarray(image[..., 0])
-        rng = stream(seed, n, 0)
-        effects = [degrade.climb(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
-        image = degrade.apply(image, rng, effects)
-        target = out / name if name.endswith(".png") else out / f"{name}.png"
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataError(f"{target.parent}: cannot be made, {error.strerror}") from None
-        packed = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image)[1]
-        write_atomic(target, packed.tobytes())
-        yield target, effects
-    if broken:
-        raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")

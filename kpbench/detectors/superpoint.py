@@ -24,11 +24,10 @@ from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
 from kpbench.images import resize
 from kpbench.patches.design import parse_patch
-from kpbench.types import Detections, Float, UInt8
+from kpbench.types import Detections, Float, Float32, UInt8
 
 CELL = 8
 SCHEMA = "kpbench.superpoint/1"
-Float32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True)

@@ -14,19 +14,17 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench.detectors.interface import to_grey
 from kpbench.errors import DataError
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting import sector_search as sectors
-from kpbench.fitting import templates as match
+from kpbench.fitting.align import WHOLE_PX, Poses, align, short_axis
+from kpbench.fitting.pyramid import Picture
+from kpbench.fitting.templates import bank
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.types import Detections, Float, UInt8
+from kpbench.types import Detections, Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
-
-Float32 = NDArray[np.float32]
-Ints = NDArray[np.int64]
 
 VERSION = "1"
 """Version of the method. Raise it by one when detections change."""
@@ -94,7 +92,7 @@ class Candidates:
     range : from the darkest to the brightest of the image, grey levels.
     """
 
-    which: Ints
+    which: Int
     core: Float
     whole: Float
     fit: refine.Fit
@@ -110,7 +108,7 @@ class Candidates:
         """
         contrast = np.maximum(self.fit.white - self.fit.black, 1.0)
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
-        relative_blur = np.minimum(self.fit.blur_px / np.maximum(match.short_axis(self.fit.A), 0.5), 1)
+        relative_blur = np.minimum(self.fit.blur_px / np.maximum(short_axis(self.fit.A), 0.5), 1)
         evidence = (
             -12.55
             + sectors.likeness(self.core, self.whole)
@@ -167,18 +165,18 @@ class TemplateDetector:
 
     def candidates(self, grey: UInt8) -> Candidates:
         """Everything in a grey image that is enough like a design to be fitted."""
-        known = match.bank(self.patches)
-        picture = match.Picture(grey)
+        known = bank(self.patches)
+        picture = Picture(grey)
         raw, smooth = picture.raw, picture.smooth
         poses = sectors.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
         poses = poses[poses.ncc > 0.62]
         for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
-            poses = match.align(smooth, poses, known.core, steps, 0.9 * sectors.RING_PX)
+            poses = align(smooth, poses, known.core, steps, 0.9 * sectors.RING_PX)
             poses = poses[poses.ncc > least]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
         core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
         row, turned = sectors.alike(sectors.extend(smooth, core, known), known)
-        whole = match.align(smooth, turned, known.whole, 4, match.WHOLE_PX)
+        whole = align(smooth, turned, known.whole, 4, WHOLE_PX)
         best = np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]  # of the rotations of each
         whole = whole[best]
         sure = sectors.likeness(core.ncc, whole.ncc) > LIKENESS
@@ -187,7 +185,7 @@ class TemplateDetector:
         return Candidates(whole.which, core.ncc, whole.ncc, fit, picture.noise, picture.range)
 
 
-def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
+def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
     """Crossings of four octaves: (n, 2) px of the image, and the octave of each."""
     levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1:4]]
     xy = [crossings(level)[0] for level in levels]
@@ -196,7 +194,7 @@ def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Ints]:
     )
 
 
-def _distinct(poses: match.Poses) -> Ints:
+def _distinct(poses: Poses) -> Int:
     """Indices of poses, best first, without those that repeat a better one of the same or of a much better design."""
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
@@ -209,7 +207,7 @@ def _distinct(poses: match.Poses) -> Ints:
     return np.flatnonzero(kept)
 
 
-def _uncovered(xy: Float, A: Float, reach: float) -> Ints:
+def _uncovered(xy: Float, A: Float, reach: float) -> Int:
     """Indices of points, best first, that lie in no better one's disc, scaled by ``reach``."""
     inside = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None]), axis=2) < reach
     kept = np.zeros(len(xy), bool)

@@ -27,8 +27,10 @@ from numpy.typing import NDArray
 from kpbench.detectors.inference import Session, open_session
 from kpbench.detectors.suppression import suppress
 from kpbench.fitting import design_fit as refine
-from kpbench.fitting import templates as match
-from kpbench.fitting.templates import Picture
+from kpbench.fitting.align import WHOLE_PX, Poses, align, rotate_within_ellipse, short_axis
+from kpbench.fitting.pyramid import Picture
+from kpbench.fitting.templates import VIEW_PX, Bank, bank
+from kpbench.fitting.views import blurred, rectify, surroundings
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 from kpbench.workers import one_blas_thread
@@ -102,7 +104,7 @@ class Hypotheses:
     at : (n, 2) px, that place.
     which : (n,) index of the design.
     xy, A : (n, 2) px, (n, 2, 2) patch frame to px.
-    view : (n, VIEW_PX²) from :func:`kpbench.fitting.view`, nan outside the image.
+    view : (n, VIEW_PX²) from :func:`kpbench.fitting.rectify`, nan outside the image.
     blur_px : (n,) standard deviation by the fit, 0 before it.
     evidence : (n, len(POSED)) or (n, len(FITTED))
     """
@@ -194,7 +196,7 @@ def ellipses(picture: Picture, xy: Float, threads: int = 0) -> tuple[Float, Floa
     """
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for block in np.split(xy, range(BLOCK, len(xy), BLOCK)) if len(xy) else ():
-        given = {"surroundings": match.surroundings(picture.smooth, block)}
+        given = {"surroundings": surroundings(picture.smooth, block)}
         odds, shift, log_map = _network("ellipse", threads).run(None, given)
         parts.append((*moved(block, np.tile(np.eye(2), (len(block), 1, 1)), shift, log_map), _clipped(odds)))
     centre, A, sure = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -216,11 +218,11 @@ def posed(
     picture: Picture, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
 ) -> Hypotheses:
     """The likely designs at every place that may be a patch, posed (parameters as for :func:`examine`)."""
-    known, levels = match.bank(patches), picture.smooth
+    known, levels = bank(patches), picture.smooth
     centre, A, odds = ellipses(picture, xy, threads)
     likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - DOUBT
     place, which = np.nonzero((likely | (odds >= SURE)[:, None]) & (odds >= EMPTY)[:, None])
-    row, poses = match.turn(levels, centre[place], A[place], which, known, (odds >= TURNED_TWICE)[place])
+    row, poses = rotate_within_ellipse(levels, centre[place], A[place], which, known, (odds >= TURNED_TWICE)[place])
     place, which = place[row], which[row]
     said = np.column_stack(
         [
@@ -235,16 +237,14 @@ def posed(
 
 def again(picture: Picture, found: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
     """Hypotheses that a judge has moved, as the image shows them where they are now."""
-    known, poses = match.bank(patches), match.Poses(found.xy, found.A, found.which, np.zeros(len(found)))
-    there = match.align(picture.smooth, poses, known.whole, 0, match.WHOLE_PX)
+    known, poses = bank(patches), Poses(found.xy, found.A, found.which, np.zeros(len(found)))
+    there = align(picture.smooth, poses, known.whole, 0, WHOLE_PX)
     return _shown(picture, found.place, found.at, there, found.evidence[:, : POSED.index(NCC)], known)
 
 
-def _shown(
-    picture: Picture, place: NDArray[np.int64], at: Float, poses: match.Poses, said: Float, known: match.Bank
-) -> Hypotheses:
+def _shown(picture: Picture, place: NDArray[np.int64], at: Float, poses: Poses, said: Float, known: Bank) -> Hypotheses:
     """What the first judge looks at: the image in these poses, and what the networks ``said`` of the places."""
-    view, contrast = match.view(picture.smooth, poses.xy, poses.A, poses.which, known)
+    view, contrast = rectify(picture.smooth, poses.xy, poses.A, poses.which, known)
     minor = _minor(poses.A)
     measured = [
         -np.log(1.01 - poses.ncc),
@@ -296,7 +296,7 @@ def fitted(picture: Picture, before: Hypotheses, odds: Float, patches: Sequence[
     )
     away = moved_on > FAR
     xy, A = np.where(away[:, None], before.xy, fit.xy), np.where(away[:, None, None], before.A, fit.A)
-    view, _ = match.view(picture.smooth, xy, A, before.which, match.bank(patches))
+    view, _ = rectify(picture.smooth, xy, A, before.which, bank(patches))
     beside = _beside(xy, minor, odds, np.column_stack([np.log(fit.blur_px + 0.3), np.log(contrast)]))
     evidence = np.column_stack([before.evidence, measured, beside])
     return Hypotheses(before.place, before.at, before.which, xy, A, view, fit.blur_px, evidence)
@@ -340,9 +340,9 @@ def inputs(found: Hypotheses, patches: Sequence[Patch]) -> dict[str, NDArray[np.
 
     The design is as blurred as the fit found the image. Outside the image there is neither: both are 0.
     """
-    side, design = match.VIEW_PX, match.bank(patches).picture[found.which]
+    side, design = VIEW_PX, bank(patches).picture[found.which]
     soft = np.flatnonzero(found.blur_px)
-    design[soft] = match.blurred(design[soft], found.A[soft], found.blur_px[soft])
+    design[soft] = blurred(design[soft], found.A[soft], found.blur_px[soft])
     pair = np.stack([found.view, design], axis=1)
     pair[np.broadcast_to(np.isnan(found.view)[:, None], pair.shape)] = 0
     return {"view": pair.reshape(-1, 2, side, side), "evidence": found.evidence.astype(np.float32)}
@@ -376,7 +376,7 @@ def _contrasts(contrast: Float, picture: Picture) -> list[Float]:
 
 
 def _minor(A: Float) -> Float:
-    return np.maximum(match.short_axis(A), 0.5)
+    return np.maximum(short_axis(A), 0.5)
 
 
 def _log_odds(probability: Float) -> Float:

@@ -13,13 +13,10 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench.geometry.coverage import Box, coverage
 from kpbench.patches.design import Patch
-from kpbench.types import Float
-
-Float32 = NDArray[np.float32]
+from kpbench.types import Float, Float32
 
 
 @dataclass(frozen=True)

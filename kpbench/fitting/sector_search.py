@@ -14,24 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from kpbench.fitting.templates import (
-    ANGLES,
-    TURNS,
-    Bank,
-    Float32,
-    Ints,
-    Poses,
-    coarsest_level,
-    look_up,
-    normalise,
-    outside_image,
-    rotated,
-    sample,
-    short_axis,
-    soft_ink,
-)
+from kpbench.fitting.align import Poses, rotated, short_axis
+from kpbench.fitting.pyramid import coarsest_level, normalise, outside_image, sample
+from kpbench.fitting.templates import ANGLES, TURNS, Bank, look_up, soft_ink
 from kpbench.patches.design import Patch
-from kpbench.types import Float
+from kpbench.types import Float, Float32, Int
 
 RING_PX = 3.0
 """Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
@@ -54,7 +41,7 @@ def _tilts() -> Float:
     return np.array(maps)
 
 
-def search(levels: Sequence[Float32], xy: Float, level: Ints, known: Bank, margin: float) -> Poses:
+def search(levels: Sequence[Float32], xy: Float, level: Int, known: Bank, margin: float) -> Poses:
     """Best tilt and rotation of each design at each place.
 
     Parameters
@@ -110,7 +97,7 @@ def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
     return Poses(poses.xy, A, poses.which, poses.ncc)
 
 
-def alike(poses: Poses, known: Bank) -> tuple[Ints, Poses]:
+def alike(poses: Poses, known: Bank) -> tuple[Int, Poses]:
     """Poses in every rotation in which the innermost sectors look the same and the whole design does not.
 
     Returns

@@ -12,8 +12,9 @@ from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import LIMIT, Breakpoint, breakpoints
 from kpbench.scoring.comparison import METRICS as COMPARED
 from kpbench.scoring.comparison import Comparison
+from kpbench.scoring.groups import Group
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
-from kpbench.scoring.scores import Group, Scores
+from kpbench.scoring.scores import Scores
 
 DIFFERENCES = len(COMPARED)
 PAPER_STYLE = 7  # grey

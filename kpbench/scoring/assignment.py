@@ -16,9 +16,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from kpbench.types import Float
+from kpbench.types import Float, Int
 
-Int = NDArray[np.int64]
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
 """What a detection is: see :class:`Matches`."""
 PAIRS_AT_ONCE = 2_000_000  # candidate pairs in memory at a time

@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri, stdtrit
 
-from kpbench.types import Float
+from kpbench.types import Float, Int
 
-Int = NDArray[np.int64]
 Interval = tuple[float, float]
 MOST_KINDS = 1000  # different scenes that a bootstrap tells apart
 

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
 from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, Matches, match
-from kpbench.types import Float, Predictions, Truth
-
-Int = NDArray[np.int64]
+from kpbench.types import Float, Int, Predictions, Truth
 
 
 @dataclass(frozen=True)

@@ -17,72 +17,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset import shard as store
-from kpbench.degrade import effects as degrade
-from kpbench.errors import DataError, DesignError
-from kpbench.files import read_toml, shipped_folder
+from kpbench.dataset.shard import Sample
+from kpbench.degrade.ladder import apply, climb
+from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
-from kpbench.patches.board import CameraBoard, find_patch, hexagon_board, keys, number
-from kpbench.patches.design import Patch, shipped_patches
+from kpbench.patches.board import CameraBoard, hexagon_board
+from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, procedural
 from kpbench.render.board_view import Look, Pose, board_keypoints, pose_board, render_board
 from kpbench.render.scene import measure_contrast, stream
+from kpbench.synth.finish import share_open
+from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float
 
-SCHEMA = "kpbench.suite/1"
 BOARD_SIDE_MM = 187.5  # a disc of 30 mm
 # Streams of random numbers of one scene; 0 to 2 belong to synth
 BACKGROUND, SCENE, EFFECT, FIELD = range(16, 20)
-
-SCENE_KEYS = {  # least and most that a suite may ask for
-    "area_percent": (0.01, 90.0),
-    "pitch_deg": (-80.0, 80.0),
-    "yaw_deg": (-80.0, 80.0),
-    "roll_deg": (0.0, 360.0),
-    "shift_x": (-0.5, 0.5),
-    "shift_y": (-0.5, 0.5),
-    "white": (0.0, 255.0),
-    "black": (0.0, 255.0),
-    "edge": (0.0, 1.0),
-    "light": (0.0, 1.0),
-    "slope_x": (-1.0, 1.0),
-    "slope_y": (-1.0, 1.0),
-    "shadow": (0.0, 1.0),
-}
-Levels = tuple[tuple[str, tuple[float, ...]], ...]
-
-
-@dataclass(frozen=True)
-class Condition:
-    """One experiment: ``pose`` and ``effects`` list, by name, a value for each rung; effects are in order."""
-
-    name: str
-    unit: str
-    rungs: tuple[float, ...]
-    pose: Levels
-    effects: Levels
-
-
-@dataclass(frozen=True)
-class Suite:
-    """A suite as its file gives it; ``scene`` holds (least, most) of everything that is drawn for a scene."""
-
-    name: str
-    images: int
-    patches: tuple[Patch, ...]
-    size_px: tuple[int, int]
-    lens_mm: float
-    pixel_um: float
-    scene: tuple[tuple[str, tuple[float, float]], ...]
-    conditions: tuple[Condition, ...]
-
-    def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
-        """The camera at another image size with the same horizontal field of view."""
-        width, height = size_px or self.size_px
-        focal_px = self.lens_mm / (self.pixel_um / 1000) * width / self.size_px[0]
-        k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
-        return Camera(width, height, focal_px, (k1, k2, p1, p2, k3))
 
 
 @dataclass(frozen=True)
@@ -245,21 +196,19 @@ class SuiteConfig:
         discs = np.column_stack([keypoints["x"], keypoints["y"], keypoints["radius_major"].astype(np.float64)])
         rng = stream(self.seed, scene, EFFECT)
         size = (self.camera.width_px, self.camera.height_px)
-        effects = [degrade.climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
+        effects = [climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
         return Shot(condition.name, condition.rungs[step], scene, board, pose, look, effects, keypoints)
 
-    def make(self, index: int) -> tuple[store.Sample, tuple[str, ...]]:
+    def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         """Image ``index``, and the broken background files met on the way."""
         shot = self.shot(index)
         background = self._background(shot.scene)
         clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
-        image = degrade.apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
+        image = apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
         keypoints = clean.keypoints
-        keypoints["visible"] *= degrade.share_open(image, shot.effects, clean.masks)
+        keypoints["visible"] *= share_open(image, shot.effects, clean.masks)
         keypoints["contrast"] = measure_contrast(image, clean.masks)
-        sample = store.Sample(
-            index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene
-        )
+        sample = Sample(index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene)
         return sample, background.broken
 
     def _background(self, scene: int) -> Background:
@@ -302,92 +251,3 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
     if "board" in config:
         return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
     return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera  # the same places whatever the patch
-
-
-def shipped_suites() -> dict[str, Path]:
-    """The suites that ship with kpbench: name to file."""
-    return {path.stem: path for path in sorted(shipped_folder("suites").glob("*.toml"))}
-
-
-def load_suite(name: str) -> Suite:
-    """Read a suite: a shipped one by its name, or any by the path of its TOML file.
-
-    Raises
-    ------
-    DataError
-        If there is none, or one line that names the file, the key and what was expected.
-    """
-    shipped = shipped_suites()
-    path = shipped.get(name, Path(name))
-    if name not in shipped and path.suffix != ".toml":
-        raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
-    table = read_toml(path, DataError)
-    try:
-        return _parse_suite(table)
-    except (DesignError, DataError) as error:
-        raise DataError(f"{path}: {error}") from None
-
-
-def _parse_suite(table: Mapping[str, Any]) -> Suite:
-    keys(table, "the suite", ("schema", "name", "images", "patches", "camera", "scene", "condition"))
-    if table.get("schema") != SCHEMA:
-        raise DataError(f"schema is {table.get('schema')!r}, expected {SCHEMA!r}")
-    camera = keys(table.get("camera"), "camera", ("size_px", "lens_mm", "pixel_um"))
-    listed = {key: table.get(key) for key in ("patches", "condition")}
-    for key, value in listed.items():
-        if not isinstance(value, list) or not value:
-            raise DataError(f"{key} is {value!r}, expected a list")
-    scene = keys(table.get("scene"), "scene", tuple(SCENE_KEYS))
-    conditions = tuple(_parse_condition(entry, f"condition[{n}]") for n, entry in enumerate(table["condition"]))
-    names = [c.name for c in conditions]
-    if len(set(names)) < len(names):
-        raise DataError(f"two conditions share a name, among: {', '.join(names)}")
-    width, height = _numbers(camera.get("size_px"), "camera.size_px", (64, 16384), 2)
-    return Suite(
-        name=_text(table.get("name"), "name"),
-        images=int(number(table, "images", 1, 1e6)),
-        patches=tuple(find_patch(shipped_patches(), key) for key in table["patches"]),
-        size_px=(int(width), int(height)),
-        lens_mm=number(camera, "lens_mm", 0.01, 1e4, "camera."),
-        pixel_um=number(camera, "pixel_um", 0.01, 1e3, "camera."),
-        scene=tuple((key, _span(scene.get(key), f"scene.{key}", bounds)) for key, bounds in SCENE_KEYS.items()),
-        conditions=conditions,
-    )
-
-
-def _parse_condition(entry: object, place: str) -> Condition:
-    table = keys(entry, place, ("name", "unit", "rungs", "pose", "effects"))
-    rungs = _numbers(table.get("rungs"), f"{place}.rungs", (-1e6, 1e6))
-    pose = keys(table.get("pose", {}), f"{place}.pose", tuple(SCENE_KEYS))
-    effects = keys(table.get("effects", {}), f"{place}.effects", tuple(degrade.LADDER))
-
-    def levels(part: Mapping[str, Any], name: str, bounds: Mapping[str, tuple[float, float]]) -> Levels:
-        return tuple((k, _numbers(v, f"{place}.{name}.{k}", bounds[k], len(rungs))) for k, v in part.items())
-
-    return Condition(
-        name=_text(table.get("name"), f"{place}.name"),
-        unit=_text(table.get("unit"), f"{place}.unit"),
-        rungs=rungs,
-        pose=levels(pose, "pose", SCENE_KEYS),
-        effects=levels(effects, "effects", {name: rung.bounds for name, rung in degrade.LADDER.items()}),
-    )
-
-
-def _text(value: object, place: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise DataError(f"{place} is {value!r}, expected a text")
-    return value
-
-
-def _numbers(value: object, place: str, bounds: tuple[float, float], count: int | None = None) -> tuple[float, ...]:
-    if not isinstance(value, list) or not value or (count is not None and len(value) != count):
-        raise DataError(f"{place} is {value!r}, expected a list of {'' if count is None else f'{count} '}numbers")
-    return tuple(number({place: v}, place, *bounds) for v in value)
-
-
-def _span(value: object, place: str, bounds: tuple[float, float]) -> tuple[float, float]:
-    """One number as (number, number), or [least, most]."""
-    least, most = _numbers(value if isinstance(value, list) else [value] * 2, place, bounds, 2)
-    if least > most:
-        raise DataError(f"{place} is {value!r}, expected [least, most]")
-    return least, most

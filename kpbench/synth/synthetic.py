@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from kpbench.dataset.shard import Sample
-from kpbench.degrade import effects as degrade
+from kpbench.degrade.ladder import ladder_mix, paper_mix
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.render.background import Background, PhotoFolder, procedural
@@ -26,6 +26,7 @@ from kpbench.render.scene import (
     stream,
     tabulate,
 )
+from kpbench.synth.finish import share_open
 from kpbench.synth.user_pipeline import augment
 
 BACKGROUND, SCENE, DETERIORATION, LOOKALIKES, AUGMENTATION = range(5)
@@ -137,14 +138,14 @@ class SynthConfig:
         image, effects = scene.image, list[dict[str, Any]]()
         keypoints, masks = scene.keypoints, scene.masks
         if self.deteriorate == "paper":
-            image, effects = degrade.paper_mix(image, stream(self.seed, index, DETERIORATION))
+            image, effects = paper_mix(image, stream(self.seed, index, DETERIORATION))
         elif self.deteriorate == "ladder":
             discs = np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
-            image, effects = degrade.ladder_mix(image, stream(self.seed, index, DETERIORATION), discs)
-            keypoints["visible"] *= degrade.share_open(image, effects, masks)
+            image, effects = ladder_mix(image, stream(self.seed, index, DETERIORATION), discs)
+            keypoints["visible"] *= share_open(image, effects, masks)
         if self.augmentation is not None:
             seed = int(stream(self.seed, index, AUGMENTATION).integers(2**31))
-            before = degrade.share_open(image, effects, masks)
+            before = share_open(image, effects, masks)
             image, moved = augment(image, placements, self.augmentation, seed)
             placements = [placement for placement in moved if placement is not None]
             masks = tuple(rasterise(placements))

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.degrade.effects import albumentations
+from kpbench.degrade.weather import albumentations
 from kpbench.errors import AugmentationError, DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project

@@ -17,18 +17,15 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from kpbench.degrade import effects as degrade
+from kpbench.degrade.ladder import paper_mix
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch
 from kpbench.render.background import PhotoFolder, decode_photo, procedural
 from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
-from kpbench.types import UInt8
+from kpbench.types import Float32, UInt8
 from kpbench.workers import end_with_parent, one_thread
-
-Float32 = NDArray[np.float32]
 
 VALIDATION_EVERY = 10
 
@@ -220,7 +217,7 @@ def _scenes(
         fixed = np.random.default_rng([seed, 1, (first + n) % config.set_size])
         background = window(photos[int(fixed.integers(len(photos)))], fixed, width, height)
         rendered = render_scene(background, random_placements(fixed, width, height, patches, Limits()))
-        image = degrade.paper_mix(rendered.image, rng)[0] if rng.random() < severity else rendered.image
+        image = paper_mix(rendered.image, rng)[0] if rng.random() < severity else rendered.image
         images[n] = image
         for k, row in enumerate(rendered.keypoints[:MOST_KEYPOINTS]):
             keypoints[n, k] = row["x"], row["y"], [p.patch_id for p in patches].index(row["patch_id"]), 0.0

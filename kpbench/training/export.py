@@ -4,28 +4,21 @@ from __future__ import annotations
 
 import io
 import json
-import logging
-import tempfile
 import warnings
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from kpbench.detectors.inference import open_session
-from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
+from kpbench.detectors.superpoint import SCHEMA
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.images import resize
-from kpbench.patches.design import parse_patch
-from kpbench.training.batches import SampleConfig, load_photos, make_batch
-from kpbench.training.loop import network_of, read_checkpoint
+from kpbench.training.checkpoint import network_of, read_checkpoint
 from kpbench.training.network import CELL, SuperPoint
 
 OPSET = 17
@@ -111,84 +104,6 @@ def export(checkpoint: str | Path, out: str | Path) -> Exported:
         raise DataError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, expected at most 1e-4")
     write_atomic(Path(out), data)
     return Exported(len(data), content["step"], difference)
-
-
-def export_int8(model: str | Path, out: str | Path) -> Exported:
-    """Write an exported float32 ONNX file once more, in 8-bit integers: a quarter of the size, three times as fast.
-
-    The ranges of the activations are those of 40 synthetic scenes over procedural backgrounds, half of them
-    deteriorated, at the scales at which the detector looks at images.
-
-    Returns
-    -------
-    Exported
-        ``difference`` is the largest one from the float32 model's logits in a noise image.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be read, was not written by :func:`export`, or is in integers already.
-    """
-    import onnx
-
-    try:
-        data = Path(model).read_bytes()
-        given = onnx.load_from_string(data)
-        content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
-    except Exception as error:  # protobuf's own, which is not public, among others
-        why = (str(error) or type(error).__name__).splitlines()[0][:200]
-        raise DataError(f"{model}: cannot be read as an ONNX file of kpbench export-model ({why})") from None
-    if content.get("schema") != SCHEMA or "int8" in content:
-        raise DataError(f"{model}: expected a float32 network of kpbench export-model")
-    patches = [parse_patch(table, str(model)) for table in content["patches"]]
-    textures = load_photos(None, "training")
-    scenes = make_batch(SampleConfig("scenes", (640, 480)), patches, textures, 0, 0, 40, 0.5).images
-    sizes = [(round(scale * 640), round(scale * 480)) for scale in SCALES]
-    images = [pad_to_cells(resize(scene, *sizes[n % len(sizes)])) for n, scene in enumerate(scenes)]
-    content["int8"] = f"uint8 activations, 7-bit weights, ranges of {len(images)} scenes"
-    quantised = quantise(given, ({"image": np.float32(1 / 255) * image[None, None]} for image in images))
-    onnx.helper.set_model_props(quantised, {"kpbench": json.dumps(content, sort_keys=True)})
-    written = cast(bytes, quantised.SerializeToString())
-    image = np.random.default_rng(0).random((1, 1, 72, 104), np.float32)
-    difference = _difference(written, image, list(open_session(data)[0].run(None, {"image": image})))
-    write_atomic(Path(out), written)
-    return Exported(len(written), content["step"], difference)
-
-
-def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any:
-    """An ONNX model with its convolutions in 8-bit integers; the ranges of its activations are those of these inputs.
-
-    Weights keep 7 bits, so that the sums of products fit 16 on processors that have no better instruction:
-    with 8 those would saturate, and give other results than the rest.
-    """
-    import onnx
-    from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-
-    class Reader(CalibrationDataReader):  # type: ignore[misc]
-        def __init__(self) -> None:
-            self.feeds = iter(feeds)
-
-        def get_next(self) -> dict[str, NDArray[np.float32]] | None:
-            return next(self.feeds, None)
-
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "int8.onnx"
-        logging.disable(logging.WARNING)  # a hint about preprocessing, which a chain of convolutions does not need
-        try:
-            quantize_static(
-                model,
-                out,
-                Reader(),
-                quant_format=QuantFormat.QDQ,
-                per_channel=True,
-                reduce_range=True,
-                activation_type=QuantType.QUInt8,
-                weight_type=QuantType.QInt8,
-                op_types_to_quantize=["Conv", "Relu", "MaxPool"],
-            )
-        finally:
-            logging.disable(logging.NOTSET)
-        return onnx.load(out)
 
 
 def _difference(data: bytes, image: Any, expected: list[Any]) -> float:

@@ -11,55 +11,35 @@ Under ``torchrun`` each process takes every n-th batch and gradients are average
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from kpbench import __version__
-from kpbench.detectors.superpoint import decode
 from kpbench.errors import DataError
-from kpbench.files import PACKAGE, write_atomic
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.training.batches import Batch, Job, load_photos, make_batch, stream
-from kpbench.training.network import SuperPoint, grow, initialise, is_folded, losses, make_targets, read_weights, unfold
-from kpbench.training.recipe import NetworkConfig, Recipe, parse_recipe
-from kpbench.types import UInt8
+from kpbench.training.batches import Job, load_photos, make_batch, stream
+from kpbench.training.checkpoint import State, designs_digest, read_checkpoint, save_checkpoint
+from kpbench.training.losses import losses, make_targets
+from kpbench.training.network import SuperPoint
+from kpbench.training.recipe import Recipe, parse_recipe
+from kpbench.training.validation import evaluate, validation_set
+from kpbench.training.weights import grow, initial_weights, initialise, is_folded, unfold
 
-SCHEMA = "kpbench.checkpoint/1"
 SAVE_EVERY = 5.0
 """Minutes between checkpoints."""
 
 
 # State and checkpoints ---------------------------------------------------------------------------------
-
-
-@dataclass
-class State:
-    """What changes while training."""
-
-    recipe: Recipe
-    network: SuperPoint
-    mean: SuperPoint  # exponential moving average of ``network``
-    optimizer: torch.optim.Optimizer
-    step: int = 0
-    seconds: float = 0.0
-
-
-def designs_digest(patches: Sequence[Patch]) -> str:
-    """SHA-256 over the designs, in their order: which network output means which ink."""
-    return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
 
 
 def start(recipe: Recipe, device: torch.device) -> State:
@@ -76,98 +56,6 @@ def start(recipe: Recipe, device: torch.device) -> State:
         network.parameters(), lr=recipe.lr, weight_decay=recipe.weight_decay, fused=device.type == "cuda" or None
     )
     return State(recipe, network, mean, optimizer)
-
-
-def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
-    """Write all of the state to one safetensors file, whole or not at all."""
-    from safetensors.torch import save
-
-    tensors = {f"network.{k}": v for k, v in state.network.state_dict().items()}
-    tensors |= {f"mean.{k}": v for k, v in state.mean.state_dict().items()}
-    for name, parameter in state.network.named_parameters():
-        for key, value in state.optimizer.state.get(parameter, {}).items():
-            tensors[f"optimizer.{key}.{name}"] = value
-    content = {
-        "schema": SCHEMA,
-        "recipe": asdict(state.recipe),
-        "step": state.step,
-        "seconds": round(state.seconds, 1),
-        "patches": [p.to_dict() for p in patches],
-        "designs": designs_digest(patches),
-        "versions": {"kpbench": __version__, "torch": torch.__version__},
-    }
-    packed = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    write_atomic(path, save(packed, {"kpbench": json.dumps(content)}))
-
-
-def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """(content, tensors) of a checkpoint.
-
-    Raises
-    ------
-    DataError
-        If the file is no checkpoint of this version.
-    """
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, framework="pt") as file:
-            content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error).splitlines()[0]})") from None
-    if content.get("schema") != SCHEMA:
-        raise DataError(f"{path}: no checkpoint of kpbench train, expected schema {SCHEMA!r} inside")
-    return content, tensors
-
-
-def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
-    """The running mean of a checkpoint as a network in evaluation mode."""
-    network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
-    network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
-    return network.eval()
-
-
-def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[str, Tensor], NetworkConfig | None]:
-    """A state-dict to start from, and the sizes of its network where they are told.
-
-    Published SuperPoint weights, the running mean of a checkpoint, or an ONNX file of ``kpbench export-model``,
-    ``superpoint`` and ``superpoint-small`` being those that ship. An ID head for other designs is left out.
-    """
-    path = _shipped(path)
-    if path.suffix == ".onnx":
-        content, weights = _read_exported(path)
-    else:
-        weights = read_weights(path)
-        mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
-        if not mean:
-            return weights, None
-        content, weights = read_checkpoint(path)[0], mean
-    same = content.get("designs") == designs_digest(patches)
-    kept = {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
-    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
-
-
-def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """(content, weights) of an ONNX file of ``kpbench export-model``."""
-    import onnx
-
-    try:
-        model = onnx.load(path)
-        content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
-    except Exception as error:  # protobuf's own, which is not public, among others
-        why = (str(error) or type(error).__name__).splitlines()[0][:200]
-        raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
-    if "int8" in content:
-        raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
-    if content.get("recipe", {}).get("network", {}).get("norm") == "after":
-        raise DataError(f"{path}: its BatchNorm, after the activation, cannot be put back; start from its checkpoint")
-    return content, {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
-
-
-def _shipped(path: str | Path) -> Path:
-    ours = PACKAGE / "detectors" / "weights" / f"{path}.onnx"
-    return ours if ours.is_file() and not Path(path).is_file() else Path(path)
 
 
 def resume(state: State, path: Path, patches: Sequence[Patch]) -> None:
@@ -501,50 +389,3 @@ def _bar(state: State, rank: int) -> Iterator[Callable[[int, str], None]]:
 
 
 # Validation --------------------------------------------------------------------------------------------
-
-Validation = list[tuple[str, Batch]]
-
-
-def validation_set(recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], count: int = 32) -> Validation:
-    """Whole images, clean and with the paper's deteriorations, and crops at full severity; fixed by the seed."""
-    scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
-    crops = replace(recipe.samples, kind="crops", size=(128, 128))
-    seed = recipe.seed + 2**31  # away from all training batches
-    return [
-        ("clean", make_batch(scenes, patches, photos, seed, 0, count, 0.0)),
-        ("paper", make_batch(scenes, patches, photos, seed, 0, count, 1.0)),
-        ("hard", make_batch(crops, patches, photos, seed, 1, 8 * count, 1.0)),
-    ]
-
-
-@torch.inference_mode()
-def evaluate(network: SuperPoint, validation: Validation) -> dict[str, float]:
-    """Share of keypoints found within 3 px and within 1 px, right IDs among the former, false alarms an image."""
-    network.eval()
-    device = next(network.parameters()).device
-    figures: dict[str, float] = {}
-    for name, batch in validation:
-        truths = found = close = right = alarms = 0
-        for image, keypoints in zip(batch.images, batch.keypoints, strict=True):
-            blob = torch.as_tensor(image, device=device).float()[None, None] / 255
-            detector, ids = network(blob)
-            detections = decode(detector[0].float().cpu().numpy(), ids[0].float().cpu().numpy())
-            explained = np.zeros(len(detections), bool)
-            for x, y, patch, ignore in keypoints[keypoints[:, 2] >= 0]:
-                distance = np.hypot(*(detections.xy - (x, y)).T)
-                explained |= distance <= max(3.0, ignore)
-                if ignore:
-                    continue
-                truths += 1
-                if len(distance) and distance.min() <= 3.0:
-                    found += 1
-                    close += bool(distance.min() <= 1.0)
-                    right += bool(detections.patch_id is not None and detections.patch_id[distance.argmin()] == patch)
-            alarms += int(np.sum(~explained))
-        figures |= {
-            f"{name}_found_3px": found / max(truths, 1),
-            f"{name}_found_1px": close / max(truths, 1),
-            f"{name}_id": right / max(found, 1),
-            f"{name}_alarms": alarms / len(batch.images),
-        }
-    return figures

@@ -19,7 +19,8 @@ import numpy as np
 
 import kpbench
 from kpbench.detectors.interface import DETECTORS
-from kpbench.synth.suite import SuiteConfig, load_suite
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_file import load_suite
 from kpbench.synth.synthetic import SynthConfig
 
 HERE = Path(__file__).parent
