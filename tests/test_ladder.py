@@ -16,12 +16,12 @@ from kpbench.degrade.effects import (
     low_light,
     noise,
     occlusion,
+    occlusion_cover,
     shadow_edge,
 )
 from kpbench.degrade.ladder import FUNCTIONS, LADDER, apply, climb
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import coverage
-from kpbench.synth.finish import occlusion_cover
 
 RUNGS = [(effect, level) for effect, rungs in LADDER.items() for level in rungs.levels]
 BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")

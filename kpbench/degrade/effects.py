@@ -15,7 +15,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.coverage import Box, box_around, coverage, inside_image
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -242,3 +242,16 @@ def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) ->
         radius = np.float32(size * reach_px)
         glow += np.float32(share * strength) * np.clip((radius - np.sqrt(dx * dx + dy * dy)) / 4 + 0.5, 0, 1)
     return _uint8(image + _across(glow, image))
+
+
+def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
+    """Fraction of each pixel of a box that :func:`occlusion` hides, shape (height, width)."""
+    x, y, w, h = box
+    seen = np.ones((h, w))
+    for polygon in _strips(strips):
+        around = box_around([polygon])
+        shifted = (around[0] - x, around[1] - y, *around[2:])
+        there, here = inside_image(shifted, seen)
+        if seen[there].size:
+            seen[there] *= 1 - coverage([[polygon]], [around])[0][here]
+    return 1 - seen

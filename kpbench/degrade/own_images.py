@@ -13,7 +13,7 @@ from kpbench.degrade.ladder import apply, climb
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.images import Source
-from kpbench.render.scene import stream
+from kpbench.seeds import stream
 
 
 def degrade_files(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,3 +103,11 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
     index = (offset[edge] + pixel[1] * stride[edge] + pixel[0]).astype(np.int64)
     weights: Float = np.concatenate([height - right, right])
     return np.asarray(np.bincount(np.concatenate([index, index + 1]), weights, total + 1)[:total], np.float64)
+
+
+def inside_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+    """Slices of the image and of the box for the part of a box that lies in the image."""
+    x, y, w, h = box
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
+    x1, y1 = max(x0, x1), max(y0, y1)
+    return (slice(y0, y1), slice(x0, x1)), (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))

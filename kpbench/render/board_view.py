@@ -17,11 +17,11 @@ from scipy.optimize import brentq
 
 from kpbench.errors import DataError
 from kpbench.geometry.camera import NO_DISTORTION, Camera, plane_to_camera, rotation_xyz
-from kpbench.geometry.coverage import Box, box_around, coverage
+from kpbench.geometry.coverage import Box, box_around, coverage, inside_image
 from kpbench.geometry.homography import Ellipse, projected_disc
 from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import CameraBoard
-from kpbench.render.scene import Mask, Rendered, inside_image, measure_contrast
+from kpbench.render.scene import Mask, Rendered, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 EDGE = 0.008  # of the board's shorter side: the band along its cut edge

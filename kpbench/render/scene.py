@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.geometry.coverage import Box, box_around, edge_coverage
+from kpbench.geometry.coverage import Box, box_around, edge_coverage, inside_image
 from kpbench.geometry.homography import projected_discs
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
@@ -88,11 +88,6 @@ class Rendered:
     image: UInt8
     keypoints: NDArray[Any]
     masks: tuple[Mask, ...]
-
-
-def stream(seed: int, index: int, stage: int) -> np.random.Generator:
-    """Random numbers of one stage of one image, independent of every other stage and image."""
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(index, stage))))
 
 
 def random_placements(
@@ -231,14 +226,6 @@ def tabulate(placements: Sequence[Placement], visible: Sequence[float]) -> NDArr
         keypoints["visible"] = visible
     keypoints["contrast"] = np.nan
     return keypoints
-
-
-def inside_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of the image and of the box for the part of a box that lies in the image."""
-    x, y, w, h = box
-    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
-    x1, y1 = max(x0, x1), max(y0, y1)
-    return (slice(y0, y1), slice(x0, x1)), (slice(y0 - y, y1 - y), slice(x0 - x, x1 - x))
 
 
 def paint(image: UInt8, mask: Mask, black: float, white: float) -> float:

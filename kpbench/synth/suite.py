@@ -26,14 +26,13 @@ from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, procedural
 from kpbench.render.board_view import Look, Pose, board_keypoints, pose_board, render_board
-from kpbench.render.scene import measure_contrast, stream
+from kpbench.render.scene import measure_contrast
+from kpbench.seeds import SUITE_BACKGROUND, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, stream
 from kpbench.synth.finish import share_open
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float
 
 BOARD_SIDE_MM = 187.5  # a disc of 30 mm
-# Streams of random numbers of one scene; 0 to 2 belong to synth
-BACKGROUND, SCENE, EFFECT, FIELD = range(16, 20)
 
 
 @dataclass(frozen=True)
@@ -183,7 +182,7 @@ class SuiteConfig:
         scene = self.scene(index)
         rung, which = divmod(index // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
-        rng = stream(self.seed, scene, SCENE)
+        rng = stream(self.seed, scene, SUITE_SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
         tilt = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
@@ -194,7 +193,7 @@ class SuiteConfig:
         look = Look(drawn["black"], drawn["white"], drawn["edge"], drawn["light"], slope, drawn["shadow"])
         keypoints = board_keypoints(self.camera, pose, board)
         discs = np.column_stack([keypoints["x"], keypoints["y"], keypoints["radius_major"].astype(np.float64)])
-        rng = stream(self.seed, scene, EFFECT)
+        rng = stream(self.seed, scene, SUITE_EFFECT)
         size = (self.camera.width_px, self.camera.height_px)
         effects = [climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
         return Shot(condition.name, condition.rungs[step], scene, board, pose, look, effects, keypoints)
@@ -204,7 +203,7 @@ class SuiteConfig:
         shot = self.shot(index)
         background = self._background(shot.scene)
         clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
-        image = apply(clean.image, stream(self.seed, shot.scene, FIELD), shot.effects)
+        image = apply(clean.image, stream(self.seed, shot.scene, SUITE_FIELD), shot.effects)
         keypoints = clean.keypoints
         keypoints["visible"] *= share_open(image, shot.effects, clean.masks)
         keypoints["contrast"] = measure_contrast(image, clean.masks)
@@ -215,7 +214,7 @@ class SuiteConfig:
         """The background of a scene; as many as a shard holds are kept, as every scene comes back under each rung."""
         if scene in self._kept:
             return self._kept[scene]
-        rng, (width, height) = stream(self.seed, scene, BACKGROUND), (self.camera.width_px, self.camera.height_px)
+        rng, (width, height) = stream(self.seed, scene, SUITE_BACKGROUND), (self.camera.width_px, self.camera.height_px)
         if self.photos is None:
             background = Background(procedural(rng, width, height))
         else:

@@ -23,13 +23,18 @@ from kpbench.render.scene import (
     rasterise,
     render_scene,
     share_inside,
-    stream,
     tabulate,
+)
+from kpbench.seeds import (
+    SYNTH_AUGMENTATION,
+    SYNTH_BACKGROUND,
+    SYNTH_DETERIORATION,
+    SYNTH_LOOKALIKES,
+    SYNTH_SCENE,
+    stream,
 )
 from kpbench.synth.finish import share_open
 from kpbench.synth.user_pipeline import augment
-
-BACKGROUND, SCENE, DETERIORATION, LOOKALIKES, AUGMENTATION = range(5)
 
 
 @dataclass(frozen=True)
@@ -129,22 +134,22 @@ class SynthConfig:
         A function of (self, index, background files) and of nothing else.
         """
         width, height = self.size_px
-        background = self._background(stream(self.seed, index, BACKGROUND))
+        background = self._background(stream(self.seed, index, SYNTH_BACKGROUND))
         if self.distractors:
-            rng = stream(self.seed, index, LOOKALIKES)
+            rng = stream(self.seed, index, SYNTH_LOOKALIKES)
             draw_lookalikes(background.image, rng, int(rng.integers(self.distractors + 1)), self.patches)
-        placements = random_placements(stream(self.seed, index, SCENE), width, height, self.patches, self.limits)
+        placements = random_placements(stream(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits)
         scene = render_scene(background.image, placements)
         image, effects = scene.image, list[dict[str, Any]]()
         keypoints, masks = scene.keypoints, scene.masks
         if self.deteriorate == "paper":
-            image, effects = paper_mix(image, stream(self.seed, index, DETERIORATION))
+            image, effects = paper_mix(image, stream(self.seed, index, SYNTH_DETERIORATION))
         elif self.deteriorate == "ladder":
             discs = np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
-            image, effects = ladder_mix(image, stream(self.seed, index, DETERIORATION), discs)
+            image, effects = ladder_mix(image, stream(self.seed, index, SYNTH_DETERIORATION), discs)
             keypoints["visible"] *= share_open(image, effects, masks)
         if self.augmentation is not None:
-            seed = int(stream(self.seed, index, AUGMENTATION).integers(2**31))
+            seed = int(stream(self.seed, index, SYNTH_AUGMENTATION).integers(2**31))
             before = share_open(image, effects, masks)
             image, moved = augment(image, placements, self.augmentation, seed)
             placements = [placement for placement in moved if placement is not None]
