@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "printing"))
 import readers
 
 from kpbench.geometry.coverage import coverage

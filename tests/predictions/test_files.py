@@ -510,7 +510,7 @@ def test_coco_results_are_predictions(tmp_path):
     assert len(read_predictions(path)) == 0
 
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def test_the_published_schema_says_what_the_reader_says(tmp_path):

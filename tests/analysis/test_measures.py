@@ -20,7 +20,7 @@ from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import coverage
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
 
-DESIGNS = Path(__file__).parent.parent / "benchmarks" / "designs"
+DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
 ALTERNATIVES = kpbench.load_patches(sorted((DESIGNS / "alternatives").glob("*.toml")))
 NAMED = {p.name: p for p in (*ALTERNATIVES, *kpbench.shipped_patches())}
 ANGLES = st.sampled_from(search.ANGLES_DEG)

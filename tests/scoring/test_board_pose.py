@@ -70,7 +70,7 @@ def test_groups_are_percentiles_of_the_images_with_a_pose():
     assert astuple(everything) == (None, None, 3, 2, 2.0, pytest.approx(2.9), 3.0, pytest.approx(3.9))
     assert astuple(a) == ("a", 0, 2, 2, *astuple(everything)[4:])
     assert astuple(b) == ("b", 0, 1, 0, None, None, None, None)
-    schema = json.loads((Path(__file__).parent.parent / "docs" / "schemas" / "scores-1.json").read_text())
+    schema = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "scores-1.json").read_text())
     content = json.loads(scores_file(run, {}, pose_groups(run, errors)))
     jsonschema.Draft202012Validator(schema).validate(content)
     assert content["pose"] == [asdict(group) for group in (everything, a, b)]

@@ -289,7 +289,7 @@ def test_the_degrade_command(tmp_path):
         (["nowhere.png", "--effect", "blur", "--level", "7"], "nowhere.png: no such dataset, image, folder or video"),
         ([__file__, "--effect", "blur", "--level", "7"], "cannot be decoded as an image"),
         (
-            [Path(__file__).parent.parent / "patches", "--effect", "blur", "--level", "7"],
+            [Path(__file__).parents[2] / "patches", "--effect", "blur", "--level", "7"],
             "neither a dataset nor a folder with images",
         ),
     ],

@@ -4,38 +4,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import jsonschema
-import numpy as np
 import pytest
 from click.testing import CliRunner
+from helpers import write_dataset
 
 from kpbench.cli import main
 from kpbench.dataset.export import export_dataset
-from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
-from kpbench.dataset.shard import Sample, encode_shard, sha256_of
-from kpbench.files import write_atomic
+from kpbench.dataset.folder import open_dataset
+from kpbench.dataset.shard import sha256_of
 from kpbench.predictions.files import Predictions, write_predictions
 from kpbench.scoring.metrics import COUNTS, METRICS
-from kpbench.types import KEYPOINT_DTYPE, Detections
-
-
-def write_dataset(folder, images, condition="", seed=0):
-    """A dataset of tiny images; each entry is a list of (x, y, radius, id)."""
-    folder.mkdir()
-    samples = []
-    for n, rows in enumerate(images):
-        keypoints = np.zeros(len(rows), KEYPOINT_DTYPE)
-        for k, (x, y, radius, patch_id) in enumerate(rows):
-            keypoints[k]["x"], keypoints[k]["y"], keypoints[k]["patch_id"] = x, y, patch_id
-            keypoints[k]["radius_major"] = keypoints[k]["radius_minor"] = radius
-            keypoints[k]["H_patch2image"] = [[radius, 0, x], [0, radius, y], [0, 0, 1]]
-        rung = float(n % 2) if condition else float("nan")
-        samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
-    config = {"seed": seed}
-    path = folder / "shard-00000.h5"
-    write_atomic(path, encode_shard(samples, len(samples), config))
-    write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
-    return open_dataset(folder)
-
+from kpbench.types import Detections
 
 IMAGES = [[(10, 10, 10, 0), (50, 10, 10, 1)], [(10, 10, 10, 0)], [], [(30, 30, 20, 1)]]
 
@@ -127,7 +106,7 @@ def test_files_hold_what_the_screen_shows(here):
         for name in METRICS:
             value = group["metrics"][name]
             assert (float(row[name]) if row[name] else None) == value
-    schema = json.loads((Path(__file__).parent.parent / "docs" / "schemas" / "scores-1.json").read_text())
+    schema = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "scores-1.json").read_text())
     jsonschema.Draft202012Validator(schema).validate(content)
     before = (here / "s.json").read_bytes()
     kpbench(*args)

@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from test_cli_score import write_dataset
+from helpers import write_dataset
 
 from kpbench.cli import main
 from kpbench.errors import DataError, GateFailed

@@ -220,7 +220,7 @@ def test_mistakes_in_a_detector_of_ones_own_are_one_line_and_keep_older_predicti
 
 
 def test_template_looks_for_the_designs_it_is_told(folder):
-    other = Path(__file__).parent.parent / "benchmarks" / "designs" / "runner-up" / "007f4f4f.toml"
+    other = Path(__file__).parents[2] / "benchmarks" / "designs" / "runner-up" / "007f4f4f.toml"
     limits = Limits(count=(1, 1), radius_px=(20, 40), tilt_deg=30)
     generate(
         SynthConfig(4, size_px=(160, 120), deteriorate="none", patches=load_patches([other]), limits=limits), "set"

@@ -23,7 +23,7 @@ from kpbench.training.export import export
 from kpbench.training.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
 from kpbench.training.weights import initial_weights
 
-CONFIGS = Path(__file__).parent.parent / "configs"
+CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), down="stride", head_width=8, descriptor_width=8)
 RECIPE = Recipe("tiny", (Phase(16), Phase(16, severity=(0.0, 1.0))), network=TINY, batch=4, ema=0.9)
 

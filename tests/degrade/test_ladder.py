@@ -30,7 +30,7 @@ BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")
 @pytest.fixture(scope="module")
 def measure():
     """benchmarks/ladder.py, which measures shifts and widths."""
-    path = Path(__file__).parent.parent / "benchmarks" / "ladder.py"
+    path = Path(__file__).parents[2] / "benchmarks" / "ladder.py"
     spec = importlib.util.spec_from_file_location("benchmarks_ladder", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

@@ -10,7 +10,7 @@ import pytest
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
 
 spec = importlib.util.spec_from_file_location("leaderboard", ROOT / "benchmarks" / "leaderboard.py")

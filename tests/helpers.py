@@ -1,0 +1,27 @@
+"""What tests of several rooms make."""
+
+import numpy as np
+
+from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.shard import Sample, encode_shard, sha256_of
+from kpbench.files import write_atomic
+from kpbench.types import KEYPOINT_DTYPE
+
+
+def write_dataset(folder, images, condition="", seed=0):
+    """A dataset of tiny images; each entry is a list of (x, y, radius, id)."""
+    folder.mkdir()
+    samples = []
+    for n, rows in enumerate(images):
+        keypoints = np.zeros(len(rows), KEYPOINT_DTYPE)
+        for k, (x, y, radius, patch_id) in enumerate(rows):
+            keypoints[k]["x"], keypoints[k]["y"], keypoints[k]["patch_id"] = x, y, patch_id
+            keypoints[k]["radius_major"] = keypoints[k]["radius_minor"] = radius
+            keypoints[k]["H_patch2image"] = [[radius, 0, x], [0, radius, y], [0, 0, 1]]
+        rung = float(n % 2) if condition else float("nan")
+        samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
+    config = {"seed": seed}
+    path = folder / "shard-00000.h5"
+    write_atomic(path, encode_shard(samples, len(samples), config))
+    write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
+    return open_dataset(folder)
