@@ -4,7 +4,7 @@ With few scenes percentile intervals are too narrow and off centre. They lack th
 tails of Student's t; both are put into the percentiles (Hesterberg 2015, "What teachers should know about the
 bootstrap", section on expanded percentiles). Bias and skewness shift the percentiles (BC_a: Efron 1987, "Better
 bootstrap confidence intervals").
-``benchmarks/coverage.py`` measures how often the intervals hold the truth.
+``benchmarks/accuracy/coverage.py`` measures how often the intervals hold the truth.
 """
 
 from __future__ import annotations

@@ -273,10 +273,10 @@ def test_dask_gives_the_same_bytes(photos, tmp_path):
 
 
 def test_whatever_ends_a_run_what_is_finished_stays():
-    """One random moment of each kind; benchmarks/interrupt.py tries many, and a full disk, which needs a mount."""
+    """One random moment of each kind; `benchmarks/robustness/interrupt.py` tries many, and a full disk."""
     if not Path("/proc/self/task").exists():
         pytest.skip("finds worker processes in /proc")
-    interrupt = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "interrupt.py"))
+    interrupt = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "robustness" / "interrupt.py"))
     kinds = ("parent", "worker", "interrupt")
     assert interrupt["strike_often"](kinds, 1).keys() == set(kinds)
 

@@ -29,8 +29,8 @@ BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")
 
 @pytest.fixture(scope="module")
 def measure():
-    """benchmarks/ladder.py, which measures shifts and widths."""
-    path = Path(__file__).parents[2] / "benchmarks" / "ladder.py"
+    """benchmarks/accuracy/ladder.py, which measures shifts and widths."""
+    path = Path(__file__).parents[2] / "benchmarks" / "accuracy" / "ladder.py"
     spec = importlib.util.spec_from_file_location("benchmarks_ladder", path)
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module

@@ -103,8 +103,8 @@ def test_no_patches_is_a_scene_too():
 
 @pytest.mark.parametrize("patch", FOUR, ids=lambda patch: patch.name)
 def test_an_independent_fit_finds_the_true_centre(patch):
-    """A few of the renders that benchmarks/truth.py measures; its model shares no code with the renderer."""
-    truth = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "truth.py"))
+    """A few of the renders that benchmarks/accuracy/truth.py measures; its model shares no code with the renderer."""
+    truth = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "accuracy" / "truth.py"))
     measure = truth["measure"]
     measure.__globals__["SUB"] = 5
     errors, _ = measure(patch, 2)

@@ -13,7 +13,7 @@ from kpbench.synth.suite_file import load_suite
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
 
-spec = importlib.util.spec_from_file_location("leaderboard", ROOT / "benchmarks" / "leaderboard.py")
+spec = importlib.util.spec_from_file_location("leaderboard", ROOT / "benchmarks" / "publish" / "leaderboard.py")
 leaderboard = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(leaderboard)
 

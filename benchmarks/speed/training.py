@@ -1,6 +1,6 @@
 """Training throughput, samples a second, and what bounds it.
 
-    python benchmarks/training.py --config configs/reference.toml --backgrounds photos/ [--threads 1] [--batches 20]
+    python benchmarks/speed/training.py --config RECIPE.toml --backgrounds photos/ [--threads 1] [--batches 20]
 
 generator  one process that makes batches, and nothing else: what one of ``--workers`` of ``kpbench train`` delivers
 step       forward, backward and optimizer on a batch that is there already, on a GPU where there is one

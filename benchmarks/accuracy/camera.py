@@ -6,7 +6,7 @@ points  largest distance to cv2.projectPoints, px, without and with lens distort
 axes    largest difference to the axes of a least-squares conic through 720 rim points that cv2.projectPoints
         projected, px, without and with lens distortion
 
-    python benchmarks/camera.py --scenes 8
+    python benchmarks/accuracy/camera.py --scenes 8
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """How often the 95 % intervals hold the truth, in simulated experiments whose truth is known.
 
-    python benchmarks/coverage.py [--experiments 1000]
+    python benchmarks/accuracy/coverage.py [--experiments 1000]
 
 A scene has a quality of its own, shared by all its images; keypoints are found and named and false alarms raised at
 random with chances that depend on it. The metrics' true values follow from the distribution. The intervals are those

@@ -1,6 +1,6 @@
 """Where inside its pixel: four read-outs of the network, on the same keypoints.
 
-    python benchmarks/subpixel.py DATASET --backgrounds photos/ [--minutes 10] [--images 200]
+    python benchmarks/accuracy/subpixel.py DATASET --backgrounds photos/ [--minutes 10] [--images 200]
 
 pixel      the most probable pixel around the maximum
 mean       the centre of mass of the probability, across the borders of cells (``superpoint.locate``)

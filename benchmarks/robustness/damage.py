@@ -1,6 +1,6 @@
 """What becomes of a damaged shard: bytes flipped, files cut off. Each must be refused with one line.
 
-    python benchmarks/damage.py [--flips 500] [--cuts 100]
+    python benchmarks/robustness/damage.py [--flips 500] [--cuts 100]
 
 A small dataset is made; at evenly spaced positions of its shard one byte is inverted, and it is read. Counted
 is what `kpbench verify` says and what reading all images and columns says without it: "refused" with a one-line

@@ -1,6 +1,6 @@
 """Whether two commits write the same bytes on this machine: datasets, a suite, prints, scores.
 
-    python benchmarks/compare_commits.py OLD NEW    # two commits, such as main~3 and HEAD
+    python benchmarks/robustness/compare_commits.py OLD NEW    # two commits, such as main~3 and HEAD
 
 Each commit is checked out into a folder of its own and runs the same commands under the interpreter that runs
 this script, which must have what kpbench needs installed. Exit code 1 if a file differs or is missing.

@@ -1,6 +1,6 @@
 """How long the whole detect step takes, against PyTorch eager float32 of the plain SuperPoint.
 
-    python benchmarks/detect.py DATASET [--images 20]
+    python benchmarks/speed/detect.py DATASET [--images 20]
 
 For each detector, one image at a time, medians over the images: the network at all scales that it looks at; that with
 its decoding, which gives places; the whole step, with verification by the designs; and the step without it, at one

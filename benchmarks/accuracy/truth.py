@@ -5,7 +5,7 @@ centre again by least squares: the model is the ink at 10 x 10 points a pixel, m
 homography (no outline, no coverage, none of the renderer's code), with centre, affine deformation, the
 two inks and the background free, started up to 0.7 px and 3 % off. Prints the distance to the truth.
 
-    python benchmarks/truth.py --renders 200
+    python benchmarks/accuracy/truth.py --renders 200
 """
 
 from __future__ import annotations

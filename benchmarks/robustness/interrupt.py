@@ -5,7 +5,7 @@ Kinds: ``parent`` (kill -9 of the command), ``worker`` (kill -9 of one of its pr
 equal that of an undisturbed run and the folder must not open as a dataset unless it is whole; then ``--resume`` must
 give the undisturbed run's bytes in every file.
 
-    python benchmarks/interrupt.py [--moments 50] [--kinds parent,worker,interrupt,disk]
+    python benchmarks/robustness/interrupt.py [--moments 50] [--kinds parent,worker,interrupt,disk]
 """
 
 from __future__ import annotations

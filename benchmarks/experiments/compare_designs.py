@@ -1,6 +1,6 @@
 """The tables of docs/designs.md that `kpbench analyze-patches` does not print.
 
-    python benchmarks/designs/compare.py
+    python benchmarks/experiments/compare_designs.py
 
 Tag corners at equal area, how the choice depends on the rule's limits, and the runner-up's files.
 """
@@ -27,7 +27,7 @@ from kpbench.analysis.measures import (
 )
 from kpbench.render.background import procedural
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "designs"
 
 
 def tag_corner(dictionary, radius_px, tilt_deg):

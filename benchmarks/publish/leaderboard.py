@@ -1,7 +1,7 @@
 """The leaderboard, its figure and the README's table from the scores in benchmarks/results.
 
-    python benchmarks/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
-    python benchmarks/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
+    python benchmarks/publish/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
+    python benchmarks/publish/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
 
 The README's table and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another size or
 over photographs are kept apart.
@@ -22,7 +22,7 @@ from kpbench.report.paper import PAPER
 from kpbench.report.tables import Cell, Estimate, Table, to_markdown
 from kpbench.scoring.metrics import LABELS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"
 PAGE, FIGURE = ROOT / "docs" / "leaderboard.md", ROOT / "docs" / "severity.svg"
 ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
@@ -35,12 +35,12 @@ PANEL = (480, 300)
 HEAD = """\
 # Leaderboard
 
-Made by `python benchmarks/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote. All
-images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over each
-table. What boards of tags are, and how far they compare with patches: [benchmark](benchmark.md#patches-against-tags).
+Made by `python benchmarks/publish/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote.
+All images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over
+each table. What boards of tags are, and how far they compare with patches: [benchmark](benchmark.md#patches-against-tags).
 
 To enter a detector: run the command below a heading with `--detector` yours, then
-`python benchmarks/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
+`python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
 `benchmarks/results`. It names the dataset by its fingerprint, and whoever has the detector gets the same numbers from
 the same command.
 """
@@ -132,7 +132,7 @@ def summary(runs: list[dict[str, Any]]) -> Table:
 def readme(text: str, runs: list[dict[str, Any]]) -> str:
     """The README with its table made anew."""
     table = to_markdown(summary(runs)).partition("\n\n")[2]
-    return re.sub(r"(?s)(<!-- benchmarks/leaderboard.py -->\n).*?(?=<!-- end -->)", rf"\g<1>{table}", text)
+    return re.sub(r"(?s)(<!-- benchmarks/publish/leaderboard.py -->\n).*?(?=<!-- end -->)", rf"\g<1>{table}", text)
 
 
 def crossing(run: dict[str, Any], condition: str) -> str:

@@ -1,7 +1,7 @@
 """How a synthetic set is distributed, beside the limits that the paper sets (§3.2).
 
     kpbench synth --n 20000 --out train
-    python benchmarks/distribution.py train
+    python benchmarks/accuracy/distribution.py train
 
 Everything is measured on the truth in the shards. The inks are not in there: the scenes are drawn again from the seed,
 their poses compared with the shards' bit by bit, and their inks taken.

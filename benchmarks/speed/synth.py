@@ -10,7 +10,7 @@ All write images of one size from the same photographs, as many of them as give 
 with the same seed, the slow one over a fifth of the images; times are the process's own (waiting for the disk is left
 out), ratios are medians over the rounds.
 
-    python benchmarks/synth.py --backgrounds photos/ [--n 500] [--rounds 7] [--channels 3] [--workers] [--profile]
+    python benchmarks/speed/synth.py --backgrounds photos/ [--n 500] [--rounds 7] [--channels 3] [--workers] [--profile]
 """
 
 from __future__ import annotations

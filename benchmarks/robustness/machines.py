@@ -1,6 +1,6 @@
 """One dataset made in four ways, which must all give the same bytes.
 
-    python benchmarks/machines.py [--n 400] [--backgrounds photos/]
+    python benchmarks/robustness/machines.py [--n 400] [--backgrounds photos/]
 
 By one process, by two, by a real Dask scheduler with two worker processes of which one is killed when the first shards
 are there, and by two halves of the shards (`--shard-range`) in folders of their own that are merged.

@@ -8,7 +8,7 @@ paper, and a spread of the ink are free. What is not installed is left out.
 Last, how finely each program places an edge: the left and the upper edge of a shape at 64 places within a pixel.
 A program that knows 4 places puts edges off by up to 1/8 px and more, at every resolution.
 
-    python benchmarks/printed.py --dpi 1200
+    python benchmarks/accuracy/printed.py --dpi 1200
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "printing"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "printing"))
 import readers
 
 from kpbench.geometry.coverage import coverage

@@ -8,7 +8,7 @@ grey    mean of a suite image (paper-v1, scene 0, checker at 16 %, 640x480), PSN
 noise   standard deviation on flat grey 128.
 width   of a step edge's derivative, as the kernel size, length, radius or sigma that it belongs to.
 
-    python benchmarks/ladder.py
+    python benchmarks/accuracy/ladder.py
 """
 
 from __future__ import annotations

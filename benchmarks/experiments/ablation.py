@@ -1,6 +1,6 @@
 """What each part of the recipe is worth: short trainings from nothing that differ in one thing each.
 
-    python benchmarks/ablation.py --backgrounds photos/ [--samples 48000] [--only reference --only "no look-alikes"]
+    python benchmarks/experiments/ablation.py --backgrounds photos/ [--samples 48000] [--only reference ...]
 
 All are `configs/reference.toml` in bfloat16 with a warm-up over a tenth of the samples and one phase of severity 0 to
 0.5, one thread each, as many at once as there are cores. Prints the share of keypoints found within 3 px and 1 px,
@@ -30,8 +30,8 @@ from kpbench.training.loop import train
 from kpbench.training.recipe import Phase, Recipe, load_recipe
 from kpbench.workers import cores, one_thread
 
-CONFIGS = Path(__file__).parent.parent / "configs"
-RUNNER_UP = Path(__file__).parent / "designs" / "runner-up"
+CONFIGS = Path(__file__).parents[2] / "configs"
+RUNNER_UP = Path(__file__).parents[1] / "designs" / "runner-up"
 
 
 def _as_it_is(recipe: Recipe) -> Recipe:

@@ -1,8 +1,8 @@
 """What the evaluator costs on synthetic tables: 5 true keypoints and 6 detections an image, 5 % missed, 15 % doubled.
 
-    python benchmarks/score.py [IMAGES ...]           # growth; default 10000 100000 1000000
-    python benchmarks/score.py 100000 --files [json]  # instead: write and read every file format, or one
-    python benchmarks/score.py 100000 --rivals        # instead: beside hotcoco and faster-coco-eval, where installed
+    python benchmarks/speed/score.py [IMAGES ...]           # growth; default 10000 100000 1000000
+    python benchmarks/speed/score.py 100000 --files [json]  # instead: write and read every file format, or one
+    python benchmarks/speed/score.py 100000 --rivals        # instead: beside hotcoco and faster-coco-eval
 
 Times are CPU seconds after the imports. Every measurement runs in a process of its own, so that its peak memory is its
 own.
