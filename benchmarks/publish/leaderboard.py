@@ -37,7 +37,8 @@ HEAD = """\
 
 Made by `python benchmarks/publish/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote.
 All images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over
-each table. What boards of tags are, and how far they compare with patches: [benchmark](benchmark.md#patches-against-tags).
+each table. What boards of tags are, and how far they compare with patches:
+[benchmark](benchmark.md#patches-against-tags).
 
 To enter a detector: run the command below a heading with `--detector` yours, then
 `python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into

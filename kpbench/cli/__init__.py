@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
+import re
 import sys
 
 import click
@@ -35,6 +36,20 @@ COMMANDS = {
 }
 
 
+# Parameters of the library that an option sets under another name, for all commands
+OPTION_OF = {"size_px": "--size"}
+
+
+def name_options(message: str, command: click.Command | None) -> str:
+    """Translate parameters that the library names in backticks, such as `n` or `resume=True`, into a command's options.
+
+    What is no parameter of the command stays as it is.
+    """
+    options = {param.name: param.opts[0] for param in command.params} if command else {}
+    known = OPTION_OF | {name: option for name, option in options.items() if option.startswith("--")}
+    return re.sub(r"`(\w+)(?:=True)?`", lambda found: known.get(found[1], found[0]), message)
+
+
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is run, and turns errors into exit codes."""
 
@@ -56,7 +71,8 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except KpbenchError as error:
-            click.echo(f"kpbench: {error}", err=True)
+            command = self.get_command(ctx, ctx.invoked_subcommand or "")
+            click.echo(f"kpbench: {name_options(str(error), command)}", err=True)
             sys.exit(1)
         except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
             if not isinstance(error, BrokenPipeError):  # who closes a pipe early knows it
