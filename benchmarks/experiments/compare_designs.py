@@ -1,4 +1,4 @@
-"""The tables of docs/designs.md that `kpbench analyze-patches` does not print.
+"""The tables of docs/explanation/designs.md that `kpbench analyze-patches` does not print.
 
     python benchmarks/experiments/compare_designs.py
 

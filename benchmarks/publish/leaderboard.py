@@ -1,6 +1,6 @@
 """The leaderboard, its figure and the README's table from the scores in benchmarks/results.
 
-    python benchmarks/publish/leaderboard.py                        # docs/leaderboard.md, docs/severity.svg, README.md
+    python benchmarks/publish/leaderboard.py                        # writes README.md, and in docs/results: two files
     python benchmarks/publish/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
 
 The README's table and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another size or
@@ -24,7 +24,7 @@ from kpbench.scoring.metrics import LABELS
 
 ROOT = Path(__file__).parents[2]
 RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"
-PAGE, FIGURE = ROOT / "docs" / "leaderboard.md", ROOT / "docs" / "severity.svg"
+PAGE, FIGURE = ROOT / "docs" / "results" / "leaderboard.md", ROOT / "docs" / "results" / "severity.svg"
 ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
 METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
@@ -38,7 +38,7 @@ HEAD = """\
 Made by `python benchmarks/publish/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote.
 All images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over
 each table. What boards of tags are, and how far they compare with patches:
-[benchmark](benchmark.md#patches-against-tags).
+[fairness to tags](../explanation/fairness-to-tags.md#patches-against-tags).
 
 To enter a detector: run the command below a heading with `--detector` yours, then
 `python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into

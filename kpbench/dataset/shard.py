@@ -1,6 +1,6 @@
 """Dataset folders: shards written whole or not at all, read lazily, verified byte by byte.
 
-The format is described in ``docs/dataset.md``; this is the only module that uses h5py.
+The format is described in ``docs/reference/dataset-format.md``; this is the only module that uses h5py.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from kpbench.files import is_local
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 SCHEMA = "kpbench.dataset/1"
-# libdeflate: the output of ISA-L, zlib-ng and zlib-rs may depend on what else was in memory (docs/dataset.md)
+# libdeflate: the output of ISA-L, zlib-ng and zlib-rs may depend on what else was in memory
+# (docs/reference/dataset-format.md)
 DEFLATE_LEVEL = 1
 COLUMNS = (
     "images",

@@ -1,8 +1,8 @@
 """Detectors of tags, each for its own board of :mod:`kpbench.patches`: what a patch is to be compared with.
 
 Settings are the libraries' own but for those named below, which were chosen on scenes of another seed than the
-benchmark's, for the tags' good (docs/benchmark.md). Nothing is told about the board in the scene: any tag of the
-dictionary is reported.
+benchmark's, for the tags' good (docs/explanation/fairness-to-tags.md). Nothing is told about the board in the scene:
+any tag of the dictionary is reported.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 In memory the predictions are columns (:class:`kpbench.types.Predictions`), so that a million images are a handful
 of arrays. On disk they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or
-``.h5``, all with the same content; ``docs/predictions.md`` describes each.
+``.h5``, all with the same content; ``docs/reference/predictions-format.md`` describes each.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Sidecars: where the keypoints of a printed sheet or board are, as JSON beside the print.
 
 ``kpbench.board/1`` has positions in the board frame (for ``cv2.solvePnP``) and on the page;
-``kpbench.sheet/1``, of patches to be cut out, on the page only. ``docs/printing.md`` lists the fields.
+``kpbench.sheet/1``, of patches to be cut out, on the page only. ``docs/howto/print.md`` lists the fields.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Numbers from counts: the only place where sums become metrics. Nothing here knows images or files.
 
-What is 0/0 is undefined: nan in arrays here, None in results, never 0 or 1. ``docs/metrics.md`` describes each
-metric with its edge cases.
+What is 0/0 is undefined: nan in arrays here, None in results, never 0 or 1. ``docs/reference/metrics.md`` describes
+each metric with its edge cases.
 """
 
 from __future__ import annotations

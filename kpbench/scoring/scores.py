@@ -9,7 +9,7 @@ with the smallest distances, then the one lower in (x, y). Identities never deci
 order of images, keypoints and detections changes nothing.
 
 The chain is assignment (who explains whom) → tally (rows) → metrics and bootstrap (numbers from sums) → this module
-(groups of images). ``docs/metrics.md`` describes each metric with its edge cases.
+(groups of images). ``docs/reference/metrics.md`` describes each metric with its edge cases.
 """
 
 from __future__ import annotations

@@ -81,7 +81,7 @@ def test_noise_has_the_deviation_asked_for_and_is_seeded():
 def test_dimming_follows_the_law_asked_for():
     white = np.full((4, 4), 255, np.uint8)
     assert [int(dimming(white, k)[0, 0]) for k in (10, 20, 30, 40)] == [153, 92, 55, 33]
-    assert [int(dimming(white, k, "literal")[0, 0]) for k in (10, 20)] == [2, 0]  # black, as docs/synth.md says
+    assert [int(dimming(white, k, "literal")[0, 0]) for k in (10, 20)] == [2, 0]  # black at once
 
 
 def test_the_paper_mix_records_what_it_did():

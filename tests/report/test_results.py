@@ -46,5 +46,5 @@ def test_the_leaderboard_and_the_readme_are_made_of_the_results():
     readme = (ROOT / "README.md").read_text()
     assert leaderboard.readme(readme, leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")) == readme
     text, picture = leaderboard.page(ROOT / "benchmarks" / "results")
-    assert (ROOT / "docs" / "leaderboard.md").read_text() == text
-    assert (ROOT / "docs" / "severity.svg").read_text() == picture
+    assert (ROOT / "docs" / "results" / "leaderboard.md").read_text() == text
+    assert (ROOT / "docs" / "results" / "severity.svg").read_text() == picture
