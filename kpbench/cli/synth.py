@@ -1,15 +1,18 @@
-"""Commands that make and look at datasets."""
+"""``kpbench synth`` and ``merge``, and how a command writes a dataset."""
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kpbench.cli.options import PATCHES, SEED, SIZE, Two, run_options
 
-DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
+if TYPE_CHECKING:
+    from kpbench.dataset.folder import Dataset
+    from kpbench.dataset.generation import Recipe
 
 
 @click.command()
@@ -79,7 +82,6 @@ def synth(
       kpbench synth --n 500 --deteriorate none --augment pipeline.json --out augmented
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
-    from kpbench.cli.progress import write_dataset
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.render.scene import Limits
     from kpbench.synth.synthetic import SynthConfig
@@ -115,97 +117,61 @@ def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
       kpbench synth --n 20000 --shard-range 20:40 --out train    # on another, same shared folder
       kpbench merge train
     """
-    from kpbench.cli.progress import tell_dataset
     from kpbench.dataset.generation import merge as merged
 
-    tell_dataset(merged(dataset, parts))
+    print_dataset(merged(dataset, parts))
 
 
-@click.command()
-@DATASET
-def inspect(dataset: Path) -> None:
-    """Say what is in a dataset: size, counts, and how its keypoints are distributed.
+def write_dataset(
+    recipe: Recipe,
+    out: Path,
+    title: str,
+    *,
+    workers: int | None,
+    engine: str,
+    scheduler: str | None,
+    shard_range: tuple[int, int] | None,
+    resume: bool,
+    overwrite: bool,
+) -> None:
+    """Write a dataset with a progress bar of this title, and print a line about it.
 
-    \b
-    Example:
-      kpbench inspect kpbench-data
-    """
-    from kpbench.dataset.card import facts, histograms
-    from kpbench.dataset.folder import open_dataset
-
-    data = open_dataset(dataset)
-    click.echo(f"{'dataset':12} {data.path}")
-    for name, value in facts(data).items():
-        click.echo(f"{name:12} {value}")
-    for histogram in histograms(data):
-        click.echo(histogram.title)
-        most = max(int(histogram.counts.max()), 1)
-        for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True):
-            click.echo(f"  {label:>14} {count:>8} {share:6.1%} {'#' * round(30 * count / most)}")
-
-
-@click.command()
-@DATASET
-def verify(dataset: Path) -> None:
-    """Check every byte of a dataset against its manifest; exit 1 at the first that differs.
-
-    \b
-    Example:
-      kpbench verify kpbench-data
+    The keyword parameters are the options of ``run_options``.
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.folder import open_dataset
+    from kpbench.dataset.generation import generate, generate_part
+    from kpbench.workers import dask_executor
 
-    data = open_dataset(dataset)
-    with progress_bar(len(data), "verify") as progress:
-        for shard in data.verify():
-            progress(shard.count)
-    click.echo(f"{dataset}: {len(data)} images in {len(data.shards)} shards, all as written")
-
-
-@click.command()
-@DATASET
-@click.option("--out", type=click.Path(path_type=Path), help="PNG file; default: preview.png in the dataset.")
-@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Images on the sheet.")
-@click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True)
-@click.option(
-    "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image, px."
-)
-def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
-    """Draw a contact sheet of evenly spaced images with their true keypoints.
-
-    \b
-    Example:
-      kpbench preview kpbench-data --count 20 --columns 5
-    """
-    import cv2
-
-    from kpbench.dataset.card import overview
-    from kpbench.dataset.folder import open_dataset
-    from kpbench.files import write_atomic
-
-    data = open_dataset(dataset)
-    sheet = overview(data, count, columns, tile_width)
-    target = out or data.path / "preview.png"
-    write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
-    click.echo(str(target))
+    if resume and overwrite:
+        raise click.UsageError("--resume and --overwrite exclude each other")
+    if (engine == "dask") != (scheduler is not None):
+        raise click.UsageError("--engine dask and --scheduler ADDR belong together")
+    shards = range(*shard_range) if shard_range else None
+    total = recipe.n if shards is None else min(len(shards) * recipe.shard_size, recipe.n)
+    how: dict[str, Any] = {"workers": workers, "resume": resume, "overwrite": overwrite}
+    try:
+        with (
+            contextlib.nullcontext() if scheduler is None else dask_executor(scheduler) as executor,
+            progress_bar(total, title) as progress,
+        ):
+            how |= {"executor": executor, "progress": progress}
+            if shards is not None:
+                images = generate_part(recipe, out, shards, **how)
+                click.echo(f"{out}: {images} images in shards {shards.start}:{shards.stop}; no manifest yet")
+                return
+            run = generate(recipe, out, **how)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
+    if run.broken:
+        shown = ", ".join(run.broken[:5]) + (" …" if len(run.broken) > 5 else "")
+        click.echo(
+            f"kpbench: {len(run.broken)} background files could not be decoded and were passed over: {shown}", err=True
+        )
+    print_dataset(run.dataset)
 
 
-@click.command()
-@DATASET
-@click.option("--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True)
-@click.option("--out", type=click.Path(path_type=Path), help="New folder; default: DATASET-FORMAT.")
-def export(dataset: Path, form: str, out: Path | None) -> None:
-    """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
-
-    \b
-    Example:
-      kpbench export kpbench-data --format coco
-    """
-    from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.export import export_dataset
-    from kpbench.dataset.folder import open_dataset
-
-    data = open_dataset(dataset)
-    with progress_bar(len(data), "export") as progress:
-        click.echo(str(export_dataset(data, form, out or Path(f"{dataset}-{form}"), progress)))
+def print_dataset(dataset: Dataset) -> None:
+    """Print one line about a finished dataset."""
+    click.echo(
+        f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}"
+    )

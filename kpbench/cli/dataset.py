@@ -1,0 +1,99 @@
+"""``kpbench inspect``, ``verify``, ``preview`` and ``export``: what is done with a finished dataset."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
+
+
+@click.command()
+@DATASET
+def inspect(dataset: Path) -> None:
+    """Say what is in a dataset: size, counts, and how its keypoints are distributed.
+
+    \b
+    Example:
+      kpbench inspect kpbench-data
+    """
+    from kpbench.dataset.card import facts, histograms
+    from kpbench.dataset.folder import open_dataset
+
+    data = open_dataset(dataset)
+    click.echo(f"{'dataset':12} {data.path}")
+    for name, value in facts(data).items():
+        click.echo(f"{name:12} {value}")
+    for histogram in histograms(data):
+        click.echo(histogram.title)
+        most = max(int(histogram.counts.max()), 1)
+        for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True):
+            click.echo(f"  {label:>14} {count:>8} {share:6.1%} {'#' * round(30 * count / most)}")
+
+
+@click.command()
+@DATASET
+def verify(dataset: Path) -> None:
+    """Check every byte of a dataset against its manifest; exit 1 at the first that differs.
+
+    \b
+    Example:
+      kpbench verify kpbench-data
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.dataset.folder import open_dataset
+
+    data = open_dataset(dataset)
+    with progress_bar(len(data), "verify") as progress:
+        for shard in data.verify():
+            progress(shard.count)
+    click.echo(f"{dataset}: {len(data)} images in {len(data.shards)} shards, all as written")
+
+
+@click.command()
+@DATASET
+@click.option("--out", type=click.Path(path_type=Path), help="PNG file; default: preview.png in the dataset.")
+@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Images on the sheet.")
+@click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True)
+@click.option(
+    "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image, px."
+)
+def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
+    """Draw a contact sheet of evenly spaced images with their true keypoints.
+
+    \b
+    Example:
+      kpbench preview kpbench-data --count 20 --columns 5
+    """
+    import cv2
+
+    from kpbench.dataset.card import overview
+    from kpbench.dataset.folder import open_dataset
+    from kpbench.files import write_atomic
+
+    data = open_dataset(dataset)
+    sheet = overview(data, count, columns, tile_width)
+    target = out or data.path / "preview.png"
+    write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+    click.echo(str(target))
+
+
+@click.command()
+@DATASET
+@click.option("--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True)
+@click.option("--out", type=click.Path(path_type=Path), help="New folder; default: DATASET-FORMAT.")
+def export(dataset: Path, form: str, out: Path | None) -> None:
+    """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
+
+    \b
+    Example:
+      kpbench export kpbench-data --format coco
+    """
+    from kpbench.cli.progress import progress_bar
+    from kpbench.dataset.export import export_dataset
+    from kpbench.dataset.folder import open_dataset
+
+    data = open_dataset(dataset)
+    with progress_bar(len(data), "export") as progress:
+        click.echo(str(export_dataset(data, form, out or Path(f"{dataset}-{form}"), progress)))
