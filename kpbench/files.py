@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import os
 import re
 import tempfile
@@ -70,6 +71,21 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
         raise error(f"{path}: cannot be read, {problem.strerror}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: cannot be read, not UTF-8 text") from None
+
+
+def sha256_of(path: Path) -> str:
+    """Compute the SHA-256 of a file, as 64 hexadecimal digits.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
 
 
 def folder_at(where: str | Path) -> Path:

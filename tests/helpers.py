@@ -3,8 +3,8 @@
 import numpy as np
 
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
-from kpbench.dataset.shard import Sample, encode_shard, sha256_of
-from kpbench.files import write_atomic
+from kpbench.dataset.shard import Sample, encode_shard
+from kpbench.files import sha256_of, write_atomic
 from kpbench.types import KEYPOINT_DTYPE
 
 

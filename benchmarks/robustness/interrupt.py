@@ -26,8 +26,8 @@ import numpy as np
 
 from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate
-from kpbench.dataset.shard import sha256_of
 from kpbench.errors import DataError
+from kpbench.files import sha256_of
 from kpbench.synth.synthetic import SynthConfig
 
 CONFIG = SynthConfig(n=48, size_px=(320, 240), shard_size=4)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import SCHEMA, _reading, canonical_json, encode_utf8, open_shard, sha256_of
+from kpbench.dataset.shard import SCHEMA, _reading, canonical_json, encode_utf8, open_shard
 from kpbench.errors import DataError
-from kpbench.files import folder_at, write_atomic
+from kpbench.files import folder_at, sha256_of, write_atomic
 from kpbench.types import Truth, UInt8
 
 MANIFEST = "dataset.json"

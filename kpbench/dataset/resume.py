@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.dataset.folder import ShardEntry, recorded_digests
-from kpbench.dataset.shard import attribute, canonical_json, open_shard, sha256_of
+from kpbench.dataset.shard import attribute, canonical_json, open_shard
 from kpbench.errors import DataError
-from kpbench.files import is_local
+from kpbench.files import is_local, sha256_of
 
 LOCK = ".kpbench.lock"
 

@@ -5,7 +5,6 @@ The format is described in ``docs/reference/dataset-format.md``; this is the onl
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -148,15 +147,6 @@ def _fixed_text(values: Sequence[str]) -> NDArray[Any]:
 
 def _scene(sample: Sample) -> int:
     return sample.image_id if sample.scene_id < 0 else sample.scene_id
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 of a file."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from kpbench.files import sha256_of
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import breakpoints
 from kpbench.scoring.comparison import Comparison
@@ -31,7 +32,6 @@ def provenance(
     from importlib.metadata import version
 
     from kpbench import __version__
-    from kpbench.dataset.shard import sha256_of
 
     return {
         "kpbench": __version__,

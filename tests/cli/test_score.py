@@ -11,7 +11,7 @@ from helpers import write_dataset
 from kpbench.cli import main
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.folder import open_dataset
-from kpbench.dataset.shard import sha256_of
+from kpbench.files import sha256_of
 from kpbench.predictions.files import Predictions, write_predictions
 from kpbench.scoring.metrics import COUNTS, METRICS
 from kpbench.types import Detections

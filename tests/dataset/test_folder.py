@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from kpbench.dataset import folder
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
-from kpbench.dataset.shard import Sample, encode_shard, open_shard, sha256_of
+from kpbench.dataset.shard import Sample, encode_shard, open_shard
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
+from kpbench.files import sha256_of, write_atomic
 from kpbench.types import KEYPOINT_DTYPE
 
 CONFIG = {"seed": 3, "kind": "test"}

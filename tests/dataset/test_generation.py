@@ -16,8 +16,8 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate, generate_part, merge
-from kpbench.dataset.shard import sha256_of
 from kpbench.errors import DataError
+from kpbench.files import sha256_of
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, rasterise
 from kpbench.synth.finish import share_open

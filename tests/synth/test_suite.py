@@ -11,10 +11,10 @@ from click.testing import CliRunner
 import kpbench.synth.suite
 from kpbench.cli import main
 from kpbench.dataset.generation import generate
-from kpbench.dataset.shard import sha256_of
 from kpbench.degrade.effects import blur
 from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
+from kpbench.files import sha256_of
 from kpbench.render.background import procedural
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite, shipped_suites
