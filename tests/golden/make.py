@@ -3,8 +3,8 @@
     python tests/golden/make.py             # detections of the images that are there
     python tests/golden/make.py --images    # the images too
 
-An image is taken only if every detector gives the same detections, within a fifth of the test's tolerance, on processors
-with and without wide vector instructions (``PROCESSORS``), and if no score lies near the threshold of a detector.
+An image is taken only if every detector gives the same detections on processors with and without wide vector
+instructions (``PROCESSORS``), and if no score lies near the threshold of a detector.
 """
 
 from __future__ import annotations
