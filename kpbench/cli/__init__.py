@@ -5,12 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-import re
 import sys
 
 import click
 
 from kpbench import __version__
+from kpbench.cli.messages import name_options
 from kpbench.errors import KpbenchError
 
 # Each command lives in a module that is imported only when the command is used: `kpbench --help`
@@ -36,20 +36,6 @@ COMMANDS = {
 }
 
 
-# Parameters of the library that an option sets under another name, for all commands
-OPTION_OF = {"size_px": "--size"}
-
-
-def name_options(message: str, command: click.Command | None) -> str:
-    """Translate parameters that the library names in backticks, such as `n` or `resume=True`, into a command's options.
-
-    What is no parameter of the command stays as it is.
-    """
-    options = {param.name: param.opts[0] for param in command.params} if command else {}
-    known = OPTION_OF | {name: option for name, option in options.items() if option.startswith("--")}
-    return re.sub(r"`(\w+)(?:=True)?`", lambda found: known.get(found[1], found[0]), message)
-
-
 class LazyGroup(click.Group):
     """A group that imports a command's module when the command is run, and turns errors into exit codes."""
 
@@ -71,8 +57,7 @@ class LazyGroup(click.Group):
         try:
             return super().invoke(ctx)
         except KpbenchError as error:
-            command = self.get_command(ctx, ctx.invoked_subcommand or "")
-            click.echo(f"kpbench: {name_options(str(error), command)}", err=True)
+            click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
         except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
             if not isinstance(error, BrokenPipeError):  # who closes a pipe early knows it
@@ -81,8 +66,12 @@ class LazyGroup(click.Group):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
-            click.echo(f"kpbench: interrupted{f': {stop}' if str(stop) else ''}", err=True)
+            click.echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
             sys.exit(130)
+
+    def _translate(self, ctx: click.Context, problem: BaseException) -> str:
+        """Write a problem in the words of the command that met it."""
+        return name_options(str(problem), self.get_command(ctx, ctx.invoked_subcommand or ""))
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})

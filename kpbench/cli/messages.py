@@ -1,0 +1,42 @@
+"""What the library says, in the words of a command: its parameters become the command's options."""
+
+from __future__ import annotations
+
+import re
+
+import click
+
+OPTION_OF = {
+    "augmentation": "--augment",
+    "shards": "--shard-range",
+    "size_px": "--size",
+}
+"""Options whose name is not that of the library's parameter, for all commands."""
+
+
+def name_options(message: str, command: click.Command | None) -> str:
+    """Translate parameters that the library names in backticks into options and arguments of a command.
+
+    `n` becomes --n, `limits.radius_px` becomes --radius-px, `resume=True` becomes --resume, `channels=3` becomes
+    --channels 3, and `parts` becomes PARTS where it is an argument. Text in backticks that names no parameter of the
+    command stays, such as a metric or another command.
+    """
+    if command is None:
+        return message
+    options = {param.name: max(param.opts, key=len) for param in command.params if isinstance(param, click.Option)}
+    arguments = {param.name: param.human_readable_name for param in command.params if isinstance(param, click.Argument)}
+    renamed = {name: option for name, option in OPTION_OF.items() if option in options.values()}
+    known = renamed | arguments | options
+
+    def translate(found: re.Match[str]) -> str:
+        option, value = known.get(found["field"]), found["value"]
+        if option is None:
+            return found[0]
+        return option if value in (None, "True") else f"{option} {value}"
+
+    return re.sub(r"""`(?:\w+\.)*(?P<field>\w+)(?:=["']?(?P<value>[^`]+?)["']?)?`""", translate, message)
+
+
+def warn(message: str) -> None:
+    """Print a line on stderr, in the words of the command that runs."""
+    click.echo(f"kpbench: {name_options(message, click.get_current_context().command)}", err=True)
