@@ -33,7 +33,7 @@ from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.fitting.pyramid import Picture
 from kpbench.fitting.templates import VIEW_PX
 from kpbench.fitting.views import OCTAVES, surroundings
-from kpbench.workers import cores, one_thread
+from kpbench.workers import count_cores, use_one_thread
 
 NEAR, FAR = 0.6, 1.0
 """A place within so many short semi-axes of a keypoint is on its patch; one beyond so many long ones of all on none."""
@@ -78,7 +78,7 @@ _detector: SmallSuperPointDetector
 def start() -> None:
     """What each worker process keeps."""
     global _detector
-    one_thread()
+    use_one_thread()
     _detector = SmallSuperPointDetector()
 
 
@@ -133,8 +133,8 @@ def main() -> None:
     parser.add_argument("--go-on", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    torch.set_num_threads(cores())
-    with ProcessPoolExecutor(cores(), initializer=start) as pool:
+    torch.set_num_threads(count_cores())
+    with ProcessPoolExecutor(count_cores(), initializer=start) as pool:
         parts = []
         for path in options.datasets:
             count = len(kpbench.open_dataset(path))

@@ -39,7 +39,7 @@ from kpbench.detectors.suppression import suppress
 from kpbench.fitting.align import short_axis
 from kpbench.fitting.pyramid import Picture
 from kpbench.fitting.templates import VIEW_PX, bank
-from kpbench.workers import cores, one_thread
+from kpbench.workers import count_cores, use_one_thread
 
 MORE = 1.0
 """Log odds by which more hypotheses are looked at again and fitted, to train."""
@@ -105,7 +105,7 @@ _judge: Judge
 def start(model: str | None, judge: Judge | None = None) -> None:
     """What each worker process keeps."""
     global _detector, _judge
-    one_thread()
+    use_one_thread()
     _detector = SuperPointDetector(Path(model)) if model else SmallSuperPointDetector()
     if judge is not None:
         torch.set_num_threads(1)
@@ -181,11 +181,11 @@ def main() -> None:
     parser.add_argument("--go-on", action="store_true")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    torch.set_num_threads(cores())
+    torch.set_num_threads(count_cores())
     go_on = ("posed", "fitted") if options.go_on else (None, None)
     start(options.model)
     paths = [*options.datasets, options.test]
-    with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model,)) as pool:
+    with ProcessPoolExecutor(count_cores(), initializer=start, initargs=(options.model,)) as pool:
         sets = [
             list(tqdm(pool.map(partial(look, path, path != options.test), range(count)), f"look {path}", count))
             for path in paths
@@ -196,7 +196,7 @@ def main() -> None:
     found, known = [look for one in seen for look in (one.posed, one.again)], [kp for kp in truths for _ in range(2)]
     before = trained(found, known, np.concatenate([one.odds for one in seen]), 0.2, 32, options.epochs, go_on[0])
     fits = []
-    with ProcessPoolExecutor(cores(), initializer=start, initargs=(options.model, before)) as pool:
+    with ProcessPoolExecutor(count_cores(), initializer=start, initargs=(options.model, before)) as pool:
         for path, part in zip(paths, sets, strict=True):
             found = pool.map(partial(fit, path, path != options.test), range(len(part)), [one.posed for one in part])
             fits.append(list(tqdm(found, f"fit {path}", len(part))))

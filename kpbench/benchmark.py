@@ -32,7 +32,7 @@ from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.types import Predictions
-from kpbench.workers import Progress, run_pieces
+from kpbench.workers import Progress, run_jobs
 
 PART = 32  # images whose detections are kept together
 
@@ -173,7 +173,7 @@ def _parts(dataset: Dataset, detector: str, about: dict[str, Any], file: Path) -
 def _detect(parts: Sequence[_Part], workers: int | None, progress: Progress) -> None:
     todo = [part for part in parts if not part.file.exists()]
     progress(sum(part.count for part in parts) - sum(part.count for part in todo))
-    for _ in run_pieces(_detect_part, todo, workers, progress):
+    for _ in run_jobs(_detect_part, todo, workers, progress):
         pass
 
 

@@ -1,14 +1,14 @@
-"""Run independent pieces of work in this process or in worker processes, with one progress count."""
+"""Run independent jobs in this process, in worker processes or on a Dask cluster."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -18,7 +18,7 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache
 from typing import Any, TypeVar
 
@@ -27,103 +27,159 @@ from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from kpbench.errors import DataError
 
-Piece = TypeVar("Piece")
-Result = TypeVar("Result")
+JobT = TypeVar("JobT")
+ResultT = TypeVar("ResultT")
 Progress = Callable[[int], None]
-"""Called with the number of images that are finished since the last call."""
+"""A function that is called with the number of images finished since its last call."""
+PROGRESS_INTERVAL_S = 0.2
+"""Longest time between two reports of progress, s: a progress bar moves smoothly."""
+JOBS_AHEAD = 4
+"""Jobs per worker process that :func:`run_in_order` submits before their results are asked for."""
+
+WORKER_DIED = "a worker process died (out of memory?)"
 
 
-def cores() -> int:
-    """Cores that this process may use."""
+def count_cores() -> int:
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def run_pieces(
-    work: Callable[[Piece, Progress], Result],
-    pieces: Sequence[Piece],
+def run_jobs(
+    work: Callable[[JobT, Progress], ResultT],
+    jobs: Sequence[JobT],
     workers: int | None,
     progress: Progress,
     executor: Executor | None = None,
-) -> Iterator[Result]:
-    """Yield ``work(piece, progress)`` of every piece as it is finished, in any order.
+) -> Iterator[ResultT]:
+    """Yield the result of every job as soon as the job is finished, in any order.
 
     Parameters
     ----------
-    work : picklable function; it calls its second argument as images are finished.
-    pieces : sequence
-    workers : processes; None for one a core. 1 works in this process.
-    progress : called in this process.
-    executor : any executor to work in instead; ``progress`` is then called piece by piece.
+    work : callable
+        Called as ``work(job, progress)``. It must be picklable. It reports its own finished images to ``progress``.
+    jobs : sequence
+    workers : int or None
+        Number of worker processes, None for one per core. With 1, the jobs run in this process.
+    progress : callable
+        Called in this process with the number of images finished since its last call.
+    executor : concurrent.futures.Executor, optional
+        Runs the jobs in place of worker processes. ``progress`` is then called once per finished job.
 
     Raises
     ------
     DataError
         If a worker process dies.
     """
-    workers = min(workers or cores(), len(pieces))
+    workers = min(workers or count_cores(), len(jobs))
     if executor is not None:
-        futures = [executor.submit(_alone, work, piece) for piece in pieces]
+        futures = [executor.submit(_run_remote, work, job) for job in jobs]
         try:
-            for result, images in _finished(futures, lambda: None):
+            for result, images in _in_order_of_completion(futures, lambda: None):
                 progress(images)
                 yield result
+        except BrokenExecutor:
+            raise DataError(WORKER_DIED) from None
         finally:
             for future in futures:
                 future.cancel()
     elif workers <= 1:
-        with _in_one_thread():
-            for piece in pieces:
-                yield work(piece, progress)
+        with _one_thread():
+            for job in jobs:
+                yield work(job, progress)
     else:
-        yield from _in_processes(work, pieces, workers, progress)
+        with _process_pool(workers) as (pool, counter):
+            reported = 0
+
+            def report_progress() -> None:
+                nonlocal reported
+                finished = counter.value
+                progress(finished - reported)
+                reported = finished
+
+            futures_here = [pool.submit(_run_counted, work, job) for job in jobs]
+            yield from _in_order_of_completion(futures_here, report_progress)
 
 
-def _in_processes(
-    work: Callable[[Piece, Progress], Result], pieces: Sequence[Piece], workers: int, progress: Progress
-) -> Iterator[Result]:
-    spawn = multiprocessing.get_context("spawn")  # a forked OpenCV or HDF5 may hang
-    counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    seen = 0
+def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers: int) -> Iterator[ResultT]:
+    """Yield the result of every job in the order of the jobs; worker processes run a few jobs ahead.
 
-    def tell() -> None:
-        nonlocal seen
-        now = counter.value
-        progress(now - seen)
-        seen = now
+    The jobs may be endless: they are taken one by one as results are asked for.
 
-    try:
-        yield from _finished([pool.submit(_in_worker, work, piece) for piece in pieces], tell)
-    except BaseException:
-        for process in set(multiprocessing.active_children()) - others:
-            process.terminate()
-        raise
-    finally:
-        # waits for the pool's own thread, which else, after a worker's death, may be half closed when Python exits
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _finished(futures: Sequence[Future[Result]], tick: Callable[[], None]) -> Iterator[Result]:
-    """Results as they come; ``tick`` is called at least every fifth of a second."""
-    waiting = set(futures)
-    try:
-        while waiting:
-            done, waiting = wait(waiting, timeout=0.2, return_when=FIRST_COMPLETED)
-            tick()
-            for future in done:
-                yield future.result()
-    except BrokenExecutor:
-        raise DataError("a worker process died (out of memory?)") from None
-
-
-@contextmanager
-def dask_executor(address: str) -> Iterator[Executor]:
-    """An executor on the workers of a Dask scheduler; a piece whose worker dies is given to another one.
+    Parameters
+    ----------
+    work : callable
+        Called as ``work(job)``. It must be picklable.
+    jobs : iterable
+    workers : int
+        Number of worker processes. With 0, each job runs in this process when its result is asked for.
 
     Raises
     ------
     DataError
-        If ``distributed`` is not installed or the scheduler does not answer.
+        If a worker process dies.
+    """
+    if workers == 0:
+        yield from map(work, jobs)
+        return
+    with _process_pool(workers) as (pool, _):
+        ahead: deque[Future[ResultT]] = deque()
+        for job in jobs:
+            ahead.append(pool.submit(work, job))
+            if len(ahead) > JOBS_AHEAD * workers:
+                yield ahead.popleft().result()
+        while ahead:
+            yield ahead.popleft().result()
+
+
+@contextmanager
+def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
+    """Start worker processes; yield their pool and a counter of finished images that they share.
+
+    When the block ends early, by an error or because nobody asks for more results, the processes are killed.
+    """
+    spawn = multiprocessing.get_context("spawn")  # a forked OpenCV, HDF5 or torch may hang
+    counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
+    pool.submit(int)  # the first job starts all processes, so the next line can tell them from the caller's own
+    processes = set(multiprocessing.active_children()) - others
+    try:
+        yield pool, counter
+    except BaseException as error:
+        for process in processes:
+            process.kill()
+        if isinstance(error, BrokenExecutor):
+            raise DataError(WORKER_DIED) from None
+        raise
+    finally:
+        # the pool has a thread of its own; after a worker's death Python must not exit while that thread cleans up
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _in_order_of_completion(futures: Sequence[Future[ResultT]], tick: Callable[[], None]) -> Iterator[ResultT]:
+    """Yield results as they come; call ``tick`` at least every ``PROGRESS_INTERVAL_S``."""
+    waiting = set(futures)
+    while waiting:
+        done, waiting = wait(waiting, timeout=PROGRESS_INTERVAL_S, return_when=FIRST_COMPLETED)
+        tick()
+        for future in done:
+            yield future.result()
+
+
+@contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """Yield an executor on the workers of a Dask scheduler.
+
+    When a worker dies, Dask gives its job to another worker, up to two times per job.
+
+    Parameters
+    ----------
+    address : str
+        Address of the scheduler, such as ``tcp://host:8786``.
+
+    Raises
+    ------
+    DataError
+        If ``distributed`` is not installed, the scheduler does not answer, or its workers die.
     """
     try:
         distributed: Any = importlib.import_module("distributed")
@@ -137,28 +193,29 @@ def dask_executor(address: str) -> Iterator[Executor]:
         try:
             yield client.get_executor(pure=False, retries=2)
         except (distributed.KilledWorker, CancelledError):
-            raise DataError(f"{address}: its workers died; finished shards are kept, add --resume to go on") from None
+            raise DataError(f"{address}: its workers died; `resume=True` keeps finished shards") from None
 
 
-def one_thread() -> None:
-    """One thread a process: BLAS's own cost more than they bring on matrices as small as ours."""
+def use_one_thread() -> None:
+    """Make OpenCV and BLAS use one thread in this process; on small matrices their threads cost more than they save."""
     cv2.setNumThreads(1)
     threadpool_limits(1)
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """For as long as it lasts; BLAS's threads wait busily, which takes the cores from all others."""
-    limit: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
+    """Make BLAS use one thread within a ``with`` block; its idle threads would keep cores busy that others need."""
+    limit: AbstractContextManager[Any] = _threadpool_controller().limit(limits=1, user_api="blas")
     return limit
 
 
 @cache
-def _controller() -> ThreadpoolController:
+def _threadpool_controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
 @contextmanager
-def _in_one_thread() -> Iterator[None]:
+def _one_thread() -> Iterator[None]:
+    """Make OpenCV and BLAS use one thread within a ``with`` block."""
     threads = cv2.getNumThreads()
     with threadpool_limits(1):
         cv2.setNumThreads(1)
@@ -169,46 +226,52 @@ def _in_one_thread() -> Iterator[None]:
 
 
 _counter: Any = None
+"""The counter of finished images that a worker process shares with its parent."""
 
 
 def _start_worker(counter: Any) -> None:
-    """Runs once in each worker: one thread, Ctrl-C is the parent's business, and an orphan ends."""
+    """Prepare a new worker process: one thread, deaf to signals, and ended with its parent.
+
+    The parent alone decides when to stop: Ctrl-C and batch systems send their signal to every process of a run.
+    """
     global _counter
     _counter = counter
-    one_thread()
-    with contextlib.suppress(ValueError):
+    use_one_thread()
+    with suppress(ValueError):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_parent()
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    _end_with_parent()
 
 
-def end_with_parent() -> None:
-    """Let this worker process end when its parent has, however that came."""
+def _end_with_parent() -> None:
+    """End this worker process as soon as its parent has ended, even if the parent was killed."""
     parent = multiprocessing.parent_process()
 
-    def wait_for_it() -> None:
+    def wait_for_parent() -> None:
         if parent is not None:
             parent.join()
             os._exit(1)
 
-    threading.Thread(target=wait_for_it, daemon=True).start()
+    threading.Thread(target=wait_for_parent, daemon=True).start()
 
 
-def _count(images: int) -> None:
+def _add_to_counter(images: int) -> None:
     with _counter.get_lock():
         _counter.value += images
 
 
-def _in_worker(work: Callable[[Piece, Progress], Result], piece: Piece) -> Result:
-    return work(piece, _count)
+def _run_counted(work: Callable[[JobT, Progress], ResultT], job: JobT) -> ResultT:
+    """Run a job in a worker process of :func:`_process_pool`."""
+    return work(job, _add_to_counter)
 
 
-def _alone(work: Callable[[Piece, Progress], Result], piece: Piece) -> tuple[Result, int]:
-    """A piece's result and its number of images, where no counter is shared."""
-    images = 0
+def _run_remote(work: Callable[[JobT, Progress], ResultT], job: JobT) -> tuple[ResultT, int]:
+    """Run a job where no counter is shared; return its result and its number of finished images."""
+    total = 0
 
-    def count(more: int) -> None:
-        nonlocal images
-        images += more
+    def add_to_total(images: int) -> None:
+        nonlocal total
+        total += images
 
-    with _in_one_thread():
-        return work(piece, count), images
+    with _one_thread():
+        return work(job, add_to_total), total

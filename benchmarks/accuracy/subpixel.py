@@ -37,7 +37,7 @@ from kpbench.detectors.superpoint import (
 )
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
 from kpbench.types import Float, UInt8
-from kpbench.workers import one_thread
+from kpbench.workers import use_one_thread
 
 SIDE = 24
 FARTHEST_PX = 2.0
@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--images", type=int, default=200)
     options = parser.parse_args()
-    one_thread()
+    use_one_thread()
     torch.set_num_threads(1)
     network = trained(options.backgrounds, options.minutes)
     dataset, detector = kpbench.open_dataset(options.dataset), SmallSuperPointDetector(threads=1)

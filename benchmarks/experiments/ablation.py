@@ -28,7 +28,7 @@ from kpbench.patches.design import load_patches, shipped_patches
 from kpbench.training import crops
 from kpbench.training.loop import train
 from kpbench.training.recipe import Phase, Recipe, load_recipe
-from kpbench.workers import cores, one_thread
+from kpbench.workers import count_cores, use_one_thread
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RUNNER_UP = Path(__file__).parents[1] / "designs" / "runner-up"
@@ -84,7 +84,7 @@ VARIANTS: dict[str, Callable[[Recipe], Recipe]] = {
 
 def run(name: str, backgrounds: Path, samples: int) -> dict[str, float]:
     """The last validation of one variant."""
-    one_thread()
+    use_one_thread()
     recipe = load_recipe(CONFIGS / "reference.toml")
     phase = Phase(samples, severity=(0.0, 0.5))
     recipe = replace(recipe, precision="bf16", seed=3, warmup=samples // 10, phases=(phase,))
@@ -112,7 +112,7 @@ def main() -> None:
     options = parser.parse_args()
     names = options.only or list(VARIANTS)
     spawn = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(cores(), spawn, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(count_cores(), spawn, max_tasks_per_child=1) as pool:
         work = partial(run, backgrounds=options.backgrounds, samples=options.samples)
         print("| variant | samples | minutes | clean: found 3 px / 1 px, id, alarms | paper: the same |")
         print("|---|---|---|---|---|")

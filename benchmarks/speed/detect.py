@@ -36,7 +36,7 @@ def main() -> None:
         "superpoint-small": (SmallSuperPointDetector(), SmallSuperPointDetector(verified=False)),
         "superpoint": (SuperPointDetector(), SuperPointDetector(verified=False)),
     }
-    torch.set_num_threads(kpbench.workers.cores())
+    torch.set_num_threads(kpbench.workers.count_cores())
     rival = SuperPoint(NetworkConfig()).eval()
     steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}
     for name, (detector, alone) in detectors.items():

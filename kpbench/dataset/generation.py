@@ -35,7 +35,7 @@ from kpbench.dataset.resume import (
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, write_atomic
-from kpbench.workers import Progress, run_pieces
+from kpbench.workers import Progress, run_jobs
 
 
 class Recipe(Protocol):
@@ -98,7 +98,7 @@ def generate(
         :class:`kpbench.synth.SynthConfig` or :class:`kpbench.synth.SuiteConfig`.
     out : folder, made if it is not there; or a URL that fsspec reaches, such as ``s3://bucket/name``.
     workers : processes; None for one a core. 1 works in this process.
-    executor : where the shards are made instead, see :func:`kpbench.workers.run_pieces`; what runs there has to see
+    executor : where the shards are made instead, see :func:`kpbench.workers.run_jobs`; what runs there has to see
         the folder and the backgrounds under the same paths.
     resume : keep the finished shards of an interrupted run and make the rest.
     overwrite : delete the dataset that is in the folder first.
@@ -257,7 +257,7 @@ def _complete(
     results = dict(kept)
     work = partial(_write_shard, config, written, folder.resolve())
     with telling_how_to_resume(folder):
-        for entry, met in run_pieces(work, todo, workers, progress, executor):
+        for entry, met in run_jobs(work, todo, workers, progress, executor):
             results[entry.file] = (entry, met)
     return results
 

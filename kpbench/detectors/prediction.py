@@ -18,7 +18,7 @@ from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import Source, image_writer
 from kpbench.types import Detections, Predictions, UInt8
-from kpbench.workers import Progress, run_pieces
+from kpbench.workers import Progress, run_jobs
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def predict(
     found: dict[int, Found] = {}
     ids = dataset.truth.image_id
     with image_writer(overlay, len(dataset)) as draw:
-        for results in run_pieces(work, pieces, workers, progress):
+        for results in run_jobs(work, pieces, workers, progress):
             found.update(results)
         for n in range(len(dataset)) if overlay is not None else ():
             draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))

@@ -6,14 +6,11 @@ Two kinds: ``scenes`` are whole images as ``kpbench synth`` writes them; ``crops
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,7 +22,7 @@ from kpbench.render.background import PhotoFolder, decode_photo, procedural
 from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.types import Float32, UInt8
-from kpbench.workers import end_with_parent, one_thread
+from kpbench.workers import run_in_order
 
 VALIDATION_EVERY = 10
 
@@ -141,7 +138,7 @@ class Job:
     severity: float
 
 
-def stream(
+def training_batches(
     config: SampleConfig,
     patches: Sequence[Patch],
     folder: str | Path | None,
@@ -149,55 +146,38 @@ def stream(
     jobs: Iterable[Job],
     workers: int,
 ) -> Iterator[Batch]:
-    """Training batches in the order of their jobs, made ahead by worker processes (0: by this one).
+    """Yield training batches in the order of their jobs, made ahead by worker processes.
 
-    The processes are started afresh, not forked: they load neither torch nor its threads.
+    The worker processes are spawned, not forked: they load neither torch nor its threads.
+
+    Parameters
+    ----------
+    config : SampleConfig
+    patches : sequence of Patch
+    folder : path or None
+        Photographs for backgrounds, see :func:`load_photos`.
+    seed : int
+    jobs : iterable of Job
+    workers : int
+        Number of worker processes. With 0, this process makes the batches.
 
     Raises
     ------
     DataError
         As :func:`load_photos`, or if a worker process dies.
     """
-    if workers == 0:
-        _start_worker(config, patches, folder, seed)
-        yield from map(_work, jobs)
-        return
-    spawn = multiprocessing.get_context("spawn")
-    arguments = (config, tuple(patches), folder, seed)
-    pool = ProcessPoolExecutor(workers, spawn, initializer=_start_worker, initargs=(*arguments, True))
-    ahead: deque[Future[Batch]] = deque()
-    try:
-        for job in jobs:
-            ahead.append(pool.submit(_work, job))
-            if len(ahead) > 4 * workers:
-                yield ahead.popleft().result()
-        while ahead:
-            yield ahead.popleft().result()
-    except BrokenExecutor:
-        raise DataError("a worker process died (out of memory?)") from None
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    _training_photos.cache_clear()
+    return run_in_order(partial(_run_job, config, tuple(patches), folder, seed), jobs, workers)
 
 
-_worker: dict[str, Any] = {}
+def _run_job(config: SampleConfig, patches: Sequence[Patch], folder: str | Path | None, seed: int, job: Job) -> Batch:
+    return make_batch(config, patches, _training_photos(folder), seed, job.index, job.count, job.severity)
 
 
-def _start_worker(
-    config: SampleConfig, patches: Sequence[Patch], folder: str | Path | None, seed: int, own: bool = False
-) -> None:
-    if own:  # the main process decides when to stop, and takes its workers with it
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        end_with_parent()
-        one_thread()
-    _worker.clear()
-    _worker.update(config=config, patches=patches, folder=folder, seed=seed)
-
-
-def _work(job: Job) -> Batch:
-    if "photos" not in _worker:  # not in the initializer, whose errors get lost
-        _worker["photos"] = load_photos(_worker.pop("folder"), "training")
-    return make_batch(**_worker, index=job.index, count=job.count, severity=job.severity)
+@lru_cache(maxsize=1)
+def _training_photos(folder: str | Path | None) -> list[UInt8]:
+    """Load the photographs once per process."""
+    return load_photos(folder, "training")
 
 
 def _scenes(

@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from kpbench.errors import DataError
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.training.batches import Job, load_photos, make_batch, stream
+from kpbench.training.batches import Job, load_photos, make_batch, training_batches
 from kpbench.training.checkpoint import State, designs_digest, read_checkpoint, save_checkpoint
 from kpbench.training.losses import losses, make_targets
 from kpbench.training.network import SuperPoint
@@ -259,7 +259,7 @@ def train(
         saved = validated = noted = time.monotonic()
         before, first = state.seconds, state.step
         sums, since = torch.zeros(2, device=device), state.step
-        for batch in stream(recipe.samples, designs, backgrounds, recipe.seed, jobs, workers):
+        for batch in training_batches(recipe.samples, designs, backgrounds, recipe.seed, jobs, workers):
             images, keypoints = (torch.from_numpy(part).to(device) for part in batch)
             pair = step_once(state, forward, images, keypoints, world)
             sums += torch.stack(pair)
