@@ -7,11 +7,9 @@ import hashlib
 import os
 import re
 import tempfile
-import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
 from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError
@@ -41,20 +39,6 @@ def image_files(folder: Path, but: Path | None = None) -> tuple[str, ...]:
     if but is not None:
         files = [f for f in files if but.resolve() not in f.resolve().parents]
     return tuple(sorted(f.relative_to(folder).as_posix() for f in files))
-
-
-def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
-    """The table of a TOML file.
-
-    Raises
-    ------
-    error
-        One line that names the file, if it cannot be read or is no TOML.
-    """
-    try:
-        return tomllib.loads(read_text(path, error))
-    except tomllib.TOMLDecodeError as problem:
-        raise error(f"{path}: not valid TOML ({problem})") from None
 
 
 def read_text(path: str | Path, error: type[KpbenchError]) -> str:

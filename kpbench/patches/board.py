@@ -15,16 +15,22 @@ from typing import Any, Protocol
 import numpy as np
 
 from kpbench.errors import DesignError
-from kpbench.files import read_toml
 from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg
 from kpbench.patches.design import Patch, load_patches, shipped_patches, unit_polygons
+from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.types import Float
 
 TOML_SCHEMA = "kpbench.board-design/1"
 HEXAGON_DIAMETER = 0.16  # of the board's side, from the paper's 16-px patch on a board of 0.5 % of the image
 HEXAGON_CIRCUMRADIUS = 0.36
 GRID_PITCH = 2.0  # disc diameters
+DEFAULT_DIAMETER_MM = 30.0
+BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
+GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
+KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
+SIZE_MM = (0.1, 5000.0)  # least and most that a board's file may ask for, of diameters and pitches
+PLACE_MM = (-25_000.0, 25_000.0)  # likewise, of coordinates
 
 
 class CameraKeypoint(Protocol):
@@ -242,94 +248,62 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
         One line that names the file, the key and what was expected.
     """
     path = Path(path)
-    table = read_toml(path, DesignError)
+    content = read_toml(path, DesignError)
+    with name_source(path, DesignError):
+        return parse_board(content, path, patches, diameter_mm)
+
+
+def parse_board(
+    content: Mapping[str, Any], path: Path, patches: Sequence[Patch] | None, diameter_mm: float | None
+) -> Board:
+    """Build a board from the content of its TOML file, see :func:`load_board`."""
+    table = TomlTable(content, BOARD_KEYS, DesignError)
+    table.require_schema(TOML_SCHEMA, optional=True)
     if "designs" in table:
-        files = table["designs"]
-        if not isinstance(files, list) or not files or not all(isinstance(f, str) for f in files):
-            raise DesignError(f"{path}: designs is {files!r}, expected a list of file names")
+        files = table.entries("designs", "a list of file names")
+        if not all(isinstance(file, str) for file in files):
+            raise table.problem("designs", "a list of file names")
         if patches is not None:
-            raise DesignError(f"{path}: designs is set in the file, and others were given; drop one of them")
-        patches = load_patches([path.parent / f for f in files])
-    try:
-        return parse_board(table, shipped_patches() if patches is None else patches, path.stem, diameter_mm)
-    except DesignError as error:
-        raise DesignError(f"{path}: {error}") from None
-
-
-def parse_board(table: Mapping[str, Any], patches: Sequence[Patch], name: str, diameter_mm: float | None) -> Board:
-    """Build a board from its TOML table, see :func:`load_board`."""
-    keys(table, "the board", ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint"))
-    if table.get("schema", TOML_SCHEMA) != TOML_SCHEMA:
-        raise DesignError(f"schema is {table['schema']!r}, expected {TOML_SCHEMA!r}")
-    name = table.get("name", name)
-    if not isinstance(name, str) or not name:
-        raise DesignError(f"name is {name!r}, expected a non-empty text")
+            raise DesignError("designs is set in the file, and others were given; drop one of them")
+        patches = load_patches([path.parent / file for file in files])
+    elif patches is None:
+        patches = shipped_patches()
+    name = table.text("name", path.stem)
     if ("grid" in table) == ("keypoint" in table):
         raise DesignError("expected either one [grid] or [[keypoint]] entries")
-    if "diameter_mm" in table:
-        if diameter_mm is not None:
-            raise DesignError(f"diameter_mm is set in the file, and {diameter_mm:g} was asked for; drop one of them")
-        diameter_mm = number(table, "diameter_mm", 0.1, 5000.0)
-    diameter = 30.0 if diameter_mm is None else diameter_mm
+    if "diameter_mm" in table and diameter_mm is not None:
+        raise DesignError(f"diameter_mm is set in the file, and {diameter_mm:g} was asked for; drop one of them")
+    diameter = table.number("diameter_mm", *SIZE_MM, DEFAULT_DIAMETER_MM if diameter_mm is None else diameter_mm)
     if "grid" in table:
-        board = _parse_grid(table["grid"], patches, diameter, name)
-        keypoints, size = board.keypoints, [board.side_x_mm, board.side_y_mm]
+        board = _parse_grid(table.table("grid", GRID_KEYS), patches, diameter, name)
+        keypoints, size = board.keypoints, (board.side_x_mm, board.side_y_mm)
     else:
-        entries = table["keypoint"]
-        if not isinstance(entries, list):
-            raise DesignError(f"keypoint is {entries!r}, expected [[keypoint]] entries")
-        keypoints = tuple(_parse_keypoint(e, f"keypoint[{n}]", patches, diameter) for n, e in enumerate(entries))
-        size = [2 * max((abs(k.x_mm) + k.extent_mm for k in keypoints), default=0.0)]
-        size += [2 * max((abs(k.y_mm) + k.extent_mm for k in keypoints), default=0.0)]
+        keypoints = tuple(_parse_keypoint(t, patches, diameter) for t in table.tables("keypoint", KEYPOINT_KEYS))
+        size = (
+            2 * max((abs(k.x_mm) + k.extent_mm for k in keypoints), default=0.0),
+            2 * max((abs(k.y_mm) + k.extent_mm for k in keypoints), default=0.0),
+        )
     if "size_mm" in table:
-        given = table["size_mm"]
-        if not isinstance(given, list) or len(given) != 2:
-            raise DesignError(f"size_mm is {given!r}, expected [width, height]")
-        size = [number({f"size_mm[{n}]": v}, f"size_mm[{n}]", 1.0, 50_000.0) for n, v in enumerate(given)]
-    return Board(name, size[0], size[1], keypoints)
+        width, height = table.numbers("size_mm", 1.0, 50_000.0, 2)
+        size = (width, height)
+    return Board(name, *size, keypoints)
 
 
-def _parse_grid(entry: object, patches: Sequence[Patch], diameter_mm: float, name: str) -> Board:
-    grid = keys(entry, "grid", ("rows", "columns", "pitch_mm", "patches"))
-    rows, columns = (number(grid, key, 1, 100, "grid.") for key in ("rows", "columns"))
-    if rows % 1 or columns % 1:
-        raise DesignError(f"grid has {rows:g} rows and {columns:g} columns, expected whole numbers")
-    pitch = number(grid, "pitch_mm", 0.1, 5000.0, "grid.") if "pitch_mm" in grid else GRID_PITCH * diameter_mm
-    listed = grid.get("patches", [p.patch_id for p in patches])
-    if not isinstance(listed, list) or not listed:
-        raise DesignError(f"grid.patches is {listed!r}, expected a list of names or ids")
-    return grid_board([find_patch(patches, key) for key in listed], int(rows), int(columns), diameter_mm, pitch, name)
+def _parse_grid(table: TomlTable, patches: Sequence[Patch], diameter_mm: float, name: str) -> Board:
+    rows, columns = (table.whole_number(key, 1, 100) for key in ("rows", "columns"))
+    pitch_mm = table.number("pitch_mm", *SIZE_MM, GRID_PITCH * diameter_mm)
+    if "patches" in table:
+        patches = [find_patch(patches, key) for key in table.entries("patches", "a list of names or ids")]
+    return grid_board(patches, rows, columns, diameter_mm, pitch_mm, name)
 
 
-def _parse_keypoint(entry: object, place: str, patches: Sequence[Patch], diameter_mm: float) -> BoardKeypoint:
-    table = keys(entry, place, ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm"))
-    try:
-        patch = find_patch(patches, table.get("patch"))
-    except DesignError as error:
-        raise DesignError(f"{place}: {error}") from None
-    place += "."
+def _parse_keypoint(table: TomlTable, patches: Sequence[Patch], diameter_mm: float) -> BoardKeypoint:
+    with name_source(table.place, DesignError):
+        patch = find_patch(patches, table.values.get("patch"))
     return BoardKeypoint(
         patch,
-        number(table, "x_mm", -25_000.0, 25_000.0, place),
-        number(table, "y_mm", -25_000.0, 25_000.0, place),
-        number(table, "rotate_deg", -360.0, 360.0, place) if "rotate_deg" in table else 0.0,
-        number(table, "diameter_mm", 0.1, 5000.0, place) if "diameter_mm" in table else diameter_mm,
+        table.number("x_mm", *PLACE_MM),
+        table.number("y_mm", *PLACE_MM),
+        table.number("rotate_deg", -360.0, 360.0, 0.0),
+        table.number("diameter_mm", *SIZE_MM, diameter_mm),
     )
-
-
-def keys(value: object, place: str, known: Sequence[str]) -> Mapping[str, Any]:
-    """The value as a table that has known keys only, or a :class:`DesignError`."""
-    if not isinstance(value, Mapping):
-        raise DesignError(f"{place} is {value!r}, expected a table with: {', '.join(known)}")
-    for name in value:
-        if name not in known:
-            raise DesignError(f"unknown key {name!r} in {place}; known are: {', '.join(known)}")
-    return value
-
-
-def number(table: Mapping[str, Any], key: str, low: float, high: float, place: str = "") -> float:
-    """The number under a key, or a :class:`DesignError`."""
-    value = table.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-        raise DesignError(f"{place}{key} is {value!r}, expected a number from {low:g} to {high:g}")
-    return float(value)

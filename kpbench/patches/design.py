@@ -20,13 +20,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.errors import DesignError
-from kpbench.files import read_toml, shipped_folder
+from kpbench.files import shipped_folder
 from kpbench.geometry.outline import Region, circle, flatten
 from kpbench.patches.contour import trace_contours
+from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.types import Float
 
 SCHEMA = "kpbench.patch/1"
 INKS = ("black", "white", "invert")
+PATCH_KEYS = ("schema", "name", "id", "disc", "semicircles", "rim", "quiet_zone")
 
 
 @dataclass(frozen=True)
@@ -157,7 +159,7 @@ def unit_polygons(patch: Patch, tolerance: float) -> tuple[tuple[Float, ...], tu
     return tuple(flatten(patch.black_region, tolerance)), tuple(flatten(patch.disc_region, tolerance))
 
 
-def parse_patch(table: Mapping[str, Any], source: str) -> Patch:
+def parse_patch(content: Mapping[str, Any], source: str) -> Patch:
     """Build a patch from its TOML table.
 
     Raises
@@ -165,61 +167,26 @@ def parse_patch(table: Mapping[str, Any], source: str) -> Patch:
     DesignError
         One line that names ``source``, the key and what was expected.
     """
-
-    def fail(message: str) -> DesignError:
-        return DesignError(f"{source}: {message}")
-
-    def number(value: object, key: str, low: float, high: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise fail(f"{key} is {value!r}, expected a number from {low:g} to {high:g}")
-        return float(value)
-
-    def choice(value: object, key: str, known: Sequence[str]) -> str:
-        if value not in known:
-            raise fail(f"{key} is {value!r}, expected one of: {', '.join(known)}")
-        return str(value)
-
-    def keys(value: object, key: str, known: Sequence[str]) -> Mapping[str, Any]:
-        if not isinstance(value, Mapping):
-            raise fail(f"{key} is {value!r}, expected a table with: {', '.join(known)}")
-        for name in value:
-            if name not in known:
-                raise fail(f"unknown key {name!r} in {key}; known are: {', '.join(known)}")
-        return value
-
-    keys(table, "the design", ("schema", "name", "id", "disc", "semicircles", "rim", "quiet_zone"))
-    if table.get("schema", SCHEMA) != SCHEMA:
-        raise fail(f"schema is {table['schema']!r}, expected {SCHEMA!r}")
-    name = table.get("name")
-    if not isinstance(name, str) or not name:
-        raise fail(f"name is {name!r}, expected a non-empty text")
-    patch_id = table.get("id")
-    if isinstance(patch_id, bool) or not isinstance(patch_id, int) or not 0 <= patch_id <= 32767:
-        raise fail(f"id is {patch_id!r}, expected a whole number from 0 to 32767")
-    listed = table.get("semicircles")
-    if not isinstance(listed, list):
-        raise fail(f"semicircles is {listed!r}, expected a list of tables with: radius, start_deg, ink")
-    semicircles = []
-    for n, entry in enumerate(listed):
-        place = f"semicircles[{n}]"
-        entry = keys(entry, place, ("radius", "start_deg", "ink"))
-        semicircles.append(
-            SemiCircle(
-                number(entry.get("radius", 1.0), f"{place}.radius", 0.01, 1.0),
-                number(entry.get("start_deg"), f"{place}.start_deg", -360.0, 360.0),
-                choice(entry.get("ink"), f"{place}.ink", INKS),
-            )
+    with name_source(source, DesignError):
+        table = TomlTable(content, PATCH_KEYS, DesignError)
+        table.require_schema(SCHEMA, optional=True)
+        rim = table.table("rim", ("width", "ink"), {})
+        return Patch(
+            name=table.text("name"),
+            patch_id=table.whole_number("id", 0, 32767),
+            disc=table.choice("disc", ("black", "white"), "white"),
+            semicircles=tuple(
+                SemiCircle(
+                    entry.number("radius", 0.01, 1.0, 1.0),
+                    entry.number("start_deg", -360.0, 360.0),
+                    entry.choice("ink", INKS),
+                )
+                for entry in table.tables("semicircles", ("radius", "start_deg", "ink"))
+            ),
+            rim=rim.number("width", 0.0, 2.0, 0.0),
+            rim_ink=rim.choice("ink", ("black", "white"), "white"),
+            quiet_zone=table.number("quiet_zone", 0.0, 2.0, 0.0),
         )
-    rim = keys(table.get("rim", {}), "rim", ("width", "ink"))
-    return Patch(
-        name=name,
-        patch_id=patch_id,
-        disc=choice(table.get("disc", "white"), "disc", ("black", "white")),
-        semicircles=tuple(semicircles),
-        rim=number(rim.get("width", 0.0), "rim.width", 0.0, 2.0),
-        rim_ink=choice(rim.get("ink", "white"), "rim.ink", ("black", "white")),
-        quiet_zone=number(table.get("quiet_zone", 0.0), "quiet_zone", 0.0, 2.0),
-    )
 
 
 def load_patch(path: str | Path) -> Patch:

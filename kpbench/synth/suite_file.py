@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from kpbench.degrade.ladder import LADDER
-from kpbench.errors import DataError, DesignError
-from kpbench.files import read_toml, shipped_folder
+from kpbench.errors import DataError
+from kpbench.files import shipped_folder
 from kpbench.geometry.camera import Camera
-from kpbench.patches.board import find_patch, keys, number
+from kpbench.patches.board import find_patch
 from kpbench.patches.design import Patch, shipped_patches
+from kpbench.toml import TomlTable, name_source, read_toml
 
 SCHEMA = "kpbench.suite/1"
-
-
+SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition")
+CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects")
 SCENE_KEYS = {  # least and most that a suite may ask for
     "area_percent": (0.01, 90.0),
     "pitch_deg": (-80.0, 80.0),
@@ -86,73 +85,42 @@ def load_suite(name: str) -> Suite:
     path = shipped.get(name, Path(name))
     if name not in shipped and path.suffix != ".toml":
         raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
-    table = read_toml(path, DataError)
-    try:
-        return _parse_suite(table)
-    except (DesignError, DataError) as error:
-        raise DataError(f"{path}: {error}") from None
+    content = read_toml(path, DataError)
+    with name_source(path, DataError):
+        return _parse_suite(TomlTable(content, SUITE_KEYS, DataError))
 
 
-def _parse_suite(table: Mapping[str, Any]) -> Suite:
-    keys(table, "the suite", ("schema", "name", "images", "patches", "camera", "scene", "condition"))
-    if table.get("schema") != SCHEMA:
-        raise DataError(f"schema is {table.get('schema')!r}, expected {SCHEMA!r}")
-    camera = keys(table.get("camera"), "camera", ("size_px", "lens_mm", "pixel_um"))
-    listed = {key: table.get(key) for key in ("patches", "condition")}
-    for key, value in listed.items():
-        if not isinstance(value, list) or not value:
-            raise DataError(f"{key} is {value!r}, expected a list")
-    scene = keys(table.get("scene"), "scene", tuple(SCENE_KEYS))
-    conditions = tuple(_parse_condition(entry, f"condition[{n}]") for n, entry in enumerate(table["condition"]))
+def _parse_suite(table: TomlTable) -> Suite:
+    table.require_schema(SCHEMA)
+    camera = table.table("camera", ("size_px", "lens_mm", "pixel_um"))
+    scene = table.table("scene", SCENE_KEYS)
+    table.entries("condition", "a list of tables")
+    conditions = tuple(_parse_condition(entry) for entry in table.tables("condition", CONDITION_KEYS))
     names = [c.name for c in conditions]
     if len(set(names)) < len(names):
         raise DataError(f"two conditions share a name, among: {', '.join(names)}")
-    width, height = _numbers(camera.get("size_px"), "camera.size_px", (64, 16384), 2)
+    width, height = camera.numbers("size_px", 64, 16384, 2, whole=True)
     return Suite(
-        name=_text(table.get("name"), "name"),
-        images=int(number(table, "images", 1, 1e6)),
-        patches=tuple(find_patch(shipped_patches(), key) for key in table["patches"]),
+        name=table.text("name"),
+        images=table.whole_number("images", 1, 1_000_000),
+        patches=tuple(find_patch(shipped_patches(), key) for key in table.entries("patches", "a list of names or ids")),
         size_px=(int(width), int(height)),
-        lens_mm=number(camera, "lens_mm", 0.01, 1e4, "camera."),
-        pixel_um=number(camera, "pixel_um", 0.01, 1e3, "camera."),
-        scene=tuple((key, _span(scene.get(key), f"scene.{key}", bounds)) for key, bounds in SCENE_KEYS.items()),
+        lens_mm=camera.number("lens_mm", 0.01, 1e4),
+        pixel_um=camera.number("pixel_um", 0.01, 1e3),
+        scene=tuple((key, scene.span(key, *bounds)) for key, bounds in SCENE_KEYS.items()),
         conditions=conditions,
     )
 
 
-def _parse_condition(entry: object, place: str) -> Condition:
-    table = keys(entry, place, ("name", "unit", "rungs", "pose", "effects"))
-    rungs = _numbers(table.get("rungs"), f"{place}.rungs", (-1e6, 1e6))
-    pose = keys(table.get("pose", {}), f"{place}.pose", tuple(SCENE_KEYS))
-    effects = keys(table.get("effects", {}), f"{place}.effects", tuple(LADDER))
-
-    def levels(part: Mapping[str, Any], name: str, bounds: Mapping[str, tuple[float, float]]) -> Levels:
-        return tuple((k, _numbers(v, f"{place}.{name}.{k}", bounds[k], len(rungs))) for k, v in part.items())
-
+def _parse_condition(table: TomlTable) -> Condition:
+    table.entries("rungs", "a list of numbers")
+    rungs = table.numbers("rungs", -1e6, 1e6)
+    pose = table.table("pose", SCENE_KEYS, {})
+    effects = table.table("effects", LADDER, {})
     return Condition(
-        name=_text(table.get("name"), f"{place}.name"),
-        unit=_text(table.get("unit"), f"{place}.unit"),
+        name=table.text("name"),
+        unit=table.text("unit"),
         rungs=rungs,
-        pose=levels(pose, "pose", SCENE_KEYS),
-        effects=levels(effects, "effects", {name: rung.bounds for name, rung in LADDER.items()}),
+        pose=tuple((key, pose.numbers(key, *SCENE_KEYS[key], len(rungs))) for key in pose.values),
+        effects=tuple((key, effects.numbers(key, *LADDER[key].bounds, len(rungs))) for key in effects.values),
     )
-
-
-def _text(value: object, place: str) -> str:
-    if not isinstance(value, str) or not value:
-        raise DataError(f"{place} is {value!r}, expected a text")
-    return value
-
-
-def _numbers(value: object, place: str, bounds: tuple[float, float], count: int | None = None) -> tuple[float, ...]:
-    if not isinstance(value, list) or not value or (count is not None and len(value) != count):
-        raise DataError(f"{place} is {value!r}, expected a list of {'' if count is None else f'{count} '}numbers")
-    return tuple(number({place: v}, place, *bounds) for v in value)
-
-
-def _span(value: object, place: str, bounds: tuple[float, float]) -> tuple[float, float]:
-    """One number as (number, number), or [least, most]."""
-    least, most = _numbers(value if isinstance(value, list) else [value] * 2, place, bounds, 2)
-    if least > most:
-        raise DataError(f"{place} is {value!r}, expected [least, most]")
-    return least, most

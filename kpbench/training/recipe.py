@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
-from kpbench.files import read_toml
+from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.training.batches import SampleConfig
 
 
@@ -183,50 +183,40 @@ def load_recipe(path: str | Path) -> Recipe:
     Raises
     ------
     DataError
-        If it cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
+        If the file cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
     """
     return parse_recipe(read_toml(path, DataError), str(path))
 
 
-def parse_recipe(table: Any, source: str) -> Recipe:
-    """A recipe from its table, see :func:`load_recipe`; ``source`` names it in messages."""
-    return _parse(Recipe, table, source, "")
+def parse_recipe(content: Mapping[str, Any], source: str) -> Recipe:
+    """Return the recipe that a table describes, see :func:`load_recipe`; ``source`` names the file in messages."""
+    with name_source(source, DataError):
+        return _parse(Recipe, TomlTable(content, get_type_hints(Recipe), DataError))
 
 
-def _parse(cls: type[T], table: Any, source: str, place: str) -> T:
-    """A dataclass from its table, nested ones too; the types of the fields say what is expected."""
-    if not isinstance(table, Mapping):
-        raise DataError(f"{source}: {place or 'the recipe'} is {table!r}, expected a table")
-    hints = get_type_hints(cls)
-    values = {}
-    for key, value in table.items():
-        where = f"{place}.{key}" if place else key
-        if key not in hints:
-            raise DataError(f"{source}: unknown key {where}; known are: {', '.join(hints)}")
-        values[key] = _value(hints[key], value, source, where)
-        if key in CHOICES and value not in CHOICES[key]:
-            raise DataError(f"{source}: {where} is {value!r}, expected one of: {', '.join(CHOICES[key])}")
-    missing = [f.name for f in fields(cls) if f.name in ("name", "phases", "samples") and f.name not in values]  # type: ignore[arg-type]
-    try:
-        return cls(**values)
-    except TypeError:
-        raise DataError(f"{source}: {place or 'the recipe'} lacks {' and '.join(missing)}") from None
-    except DataError as error:
-        raise DataError(f"{source}: {error}") from None
+def _parse(cls: type[T], table: TomlTable) -> T:
+    """Return the dataclass that a table describes; the types of the fields say which values are expected."""
+    values = {key: _parse_field(table, key, kind) for key, kind in get_type_hints(cls).items() if key in table}
+    missing = [f.name for f in fields(cls) if not _has_default(f) and f.name not in values]  # type: ignore[arg-type]
+    if missing:
+        raise DataError(f"{table.place or 'the recipe'} lacks {' and '.join(missing)}")
+    return cls(**values)
 
 
-def _value(kind: Any, value: Any, source: str, where: str) -> Any:
-    if is_dataclass(kind):
-        return _parse(kind, value, source, where)  # type: ignore[arg-type]
+def _has_default(field: Field[Any]) -> bool:
+    return field.default is not MISSING or field.default_factory is not MISSING
+
+
+def _parse_field(table: TomlTable, key: str, kind: Any) -> Any:
+    if isinstance(kind, type) and is_dataclass(kind):
+        return _parse(kind, table.table(key, get_type_hints(kind)))
     if get_origin(kind) is tuple:
-        args = get_args(kind)
-        if not isinstance(value, list | tuple) or (args[-1] is not Ellipsis and len(value) != len(args)):
-            count = "" if args[-1] is Ellipsis else f"{len(args)} "
-            raise DataError(f"{source}: {where} is {value!r}, expected a list of {count}values")
-        return tuple(_value(args[0], v, source, f"{where}[{n}]") for n, v in enumerate(value))
-    accepted = (int, float) if kind is float else kind
-    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-        raise DataError(f"{source}: {where} is {value!r}, expected {kind.__name__}")
-    if kind is not bool and kind is not str and not 0 <= value < math.inf:
-        raise DataError(f"{source}: {where} is {value!r}, expected a number from 0")
-    return kind(value)
+        element, last = get_args(kind)[0], get_args(kind)[-1]
+        if isinstance(element, type) and is_dataclass(element):
+            return tuple(_parse(element, entry) for entry in table.tables(key, get_type_hints(element)))
+        return table.numbers(key, 0, count=None if last is Ellipsis else len(get_args(kind)), whole=element is int)
+    if kind is bool:
+        return table.flag(key)
+    if kind is str:
+        return table.choice(key, CHOICES[key]) if key in CHOICES else table.text(key)
+    return table.whole_number(key, 0) if kind is int else table.number(key, 0)

@@ -90,11 +90,11 @@ GOOD = 'name = "a"\nid = 1\nsemicircles = [{ radius = 1.0, start_deg = 0, ink = 
         ),
         (GOOD.replace("id = 1", "id = -1"), "id is -1, expected a whole number"),
         (GOOD.replace("id = 1", "id = true"), "id is True, expected a whole number"),
-        (GOOD + "shape = 3\n", "unknown key 'shape' in the design"),
+        (GOOD + "shape = 3\n", "unknown key 'shape'; known are: schema, name"),
         (GOOD + 'disc = "grey"\n', "disc is 'grey', expected one of: black, white"),
         (GOOD + "rim = 0.1\n", "rim is 0.1, expected a table with: width, ink"),
         (GOOD + 'schema = "kpbench.patch/9"\n', "schema is 'kpbench.patch/9', expected 'kpbench.patch/1'"),
-        ('id = 1\nname = "a"\n', "semicircles is None"),
+        ('id = 1\nname = "a"\n', "semicircles is missing"),
         ("name = ", "not valid TOML"),
     ],
 )

@@ -189,7 +189,7 @@ TEXT = shipped_suites()["paper-v1"].read_text()
         ("lens_mm = 4.0", "lens_mm = -4", "camera.lens_mm is -4, expected a number from 0.01"),
         ("size_px = [1624, 1240]", "size_px = [1624]", r"camera.size_px is \[1624\], expected a list of 2 numbers"),
         ("pitch_deg = 0\n", "pitch = 0\n", "unknown key 'pitch' in scene"),
-        ("yaw_deg = 0\n", "", r"scene.yaw_deg is None, expected a number"),
+        ("yaw_deg = 0\n", "", r"scene.yaw_deg is missing, expected a number"),
         ("white = [190, 245]", "white = [245, 190]", r"scene.white is \[245, 190\], expected \[least, most\]"),
         (
             "{ blur = [3, 7, 11, 15] }",
@@ -200,11 +200,11 @@ TEXT = shipped_suites()["paper-v1"].read_text()
         (
             "{ blur = [3, 7, 11, 15] }",
             "{ blur = [0, 7, 11, 15] }",
-            r"condition\[2\].effects.blur is 0, expected a number",
+            r"condition\[2\].effects.blur\[0\] is 0, expected a number",
         ),
         ('name = "pitch"', 'name = "scale"', "two conditions share a name"),
         ('"checker"', '"square"', "patch 'square' is not known"),
-        ("images = 500", "images = true", "images is True, expected a number"),
+        ("images = 500", "images = true", "images is True, expected a whole number from 1 to 1000000"),
         ("[camera]", "[camera", "not valid TOML"),
     ],
 )

@@ -203,10 +203,10 @@ def test_shipped_recipes_survive_the_checkpoint(path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("name = 'a'\nphases = []\nbatches = 3", "unknown key batches; known are: name, phases, seed"),
-        ("name = 'a'\n[[phases]]\nsamples = 1\nepochs = 2", r"unknown key phases\[0\]\.epochs; known are: samples"),
+        ("name = 'a'\nphases = []\nbatches = 3", "unknown key 'batches'; known are: name, phases, seed"),
+        ("name = 'a'\n[[phases]]\nsamples = 1\nepochs = 2", r"unknown key 'epochs' in phases\[0\]; known are: samples"),
         ("phases = []", "the recipe lacks name"),
-        ("name = 'a'\nphases = []\nbatch = 'b'", "batch is 'b', expected int"),
+        ("name = 'a'\nphases = []\nbatch = 'b'", "batch is 'b', expected a whole number from 0"),
         ("name = 'a'\nphases = []\nlr = -1", "lr is -1, expected a number from 0"),
         ("name = 'a'\nphases = []\nschedule = 'linear'", "schedule is 'linear', expected one of: step, cosine"),
         ("name = 'a'\nphases = []\n[network]\nwidths = [1, 2]", r"network\.widths is \[1, 2\], expected a list of 4"),

@@ -1,0 +1,161 @@
+"""Strict reading of TOML: an unknown key or a wrong value is an error that names the place and what was expected."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from kpbench.errors import KpbenchError
+from kpbench.files import read_text
+
+
+def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Raises
+    ------
+    error
+        If the file cannot be read or is no TOML. The message names the file.
+    """
+    try:
+        return tomllib.loads(read_text(path, error))
+    except tomllib.TOMLDecodeError as problem:
+        raise error(f"{path}: not valid TOML ({problem})") from None
+
+
+@contextmanager
+def name_source(source: str | Path, error: type[KpbenchError]) -> Iterator[None]:
+    """Put the name of a file before the message of each :class:`KpbenchError`, and raise it as ``error``."""
+    try:
+        yield
+    except KpbenchError as problem:
+        raise error(f"{source}: {problem}") from None
+
+
+@dataclass(frozen=True)
+class TomlTable:
+    """A table whose keys are known; each method returns the checked value of one key.
+
+    Attributes
+    ----------
+    values : mapping
+        The table as it was read.
+    known : collection of str
+        All keys that the table may have.
+    error : type of KpbenchError
+        Raised with one line for an unknown key or a wrong value. The line does not name the file:
+        see :func:`name_source`.
+    place : str
+        Name of the table within the file, such as ``keypoint[3]``; "" for the file itself.
+    """
+
+    values: Mapping[str, Any]
+    known: Collection[str]
+    error: type[KpbenchError]
+    place: str = ""
+
+    def __post_init__(self) -> None:
+        names = ", ".join(self.known)
+        if not isinstance(self.values, Mapping):
+            raise self.error(f"{self.place or 'the file'} is {self.values!r}, expected a table with: {names}")
+        for key in self.values:
+            if key not in self.known:
+                within = f" in {self.place}" if self.place else ""
+                raise self.error(f"unknown key {key!r}{within}; known are: {names}")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
+
+    def path(self, key: str) -> str:
+        """Return the name of a value within the file, such as ``keypoint[3].x_mm``."""
+        return f"{self.place}.{key}" if self.place else key
+
+    def problem(self, key: str, expected: str) -> KpbenchError:
+        """Return the error that the value of a key deserves, for the caller to raise."""
+        value = repr(self.values[key]) if key in self.values else "missing"
+        return self.error(f"{self.path(key)} is {value}, expected {expected}")
+
+    def require_schema(self, schema: str, optional: bool = False) -> None:
+        """Raise an error unless the key ``schema`` holds this text, or is absent and ``optional``."""
+        if self.values.get("schema", schema if optional else None) != schema:
+            raise self.problem("schema", repr(schema))
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Return a text that is not empty."""
+        value = self.values.get(key, default)
+        if not isinstance(value, str) or not value:
+            raise self.problem(key, "a non-empty text")
+        return value
+
+    def choice(self, key: str, choices: Collection[str], default: str | None = None) -> str:
+        """Return a text that is one of the choices."""
+        value = self.values.get(key, default)
+        if not isinstance(value, str) or value not in choices:
+            raise self.problem(key, f"one of: {', '.join(choices)}")
+        return value
+
+    def flag(self, key: str) -> bool:
+        """Return true or false."""
+        value = self.values.get(key)
+        if not isinstance(value, bool):
+            raise self.problem(key, "true or false")
+        return value
+
+    def number(self, key: str, low: float, high: float = math.inf, default: float | None = None) -> float:
+        """Return a finite number from ``low`` to ``high``."""
+        return self._number(key, self.values.get(key, default), low, high)
+
+    def whole_number(self, key: str, low: int, high: float = math.inf) -> int:
+        """Return a whole number from ``low`` to ``high``."""
+        return int(self._number(key, self.values.get(key), low, high, whole=True))
+
+    def numbers(
+        self, key: str, low: float, high: float = math.inf, count: int | None = None, whole: bool = False
+    ) -> tuple[float, ...]:
+        """Return a list of numbers from ``low`` to ``high``, ``count`` of them or any number of them."""
+        value = self.values.get(key)
+        if not isinstance(value, list | tuple) or count not in (None, len(value)):
+            raise self.problem(key, f"a list of {'' if count is None else f'{count} '}numbers")
+        return tuple(self._number(f"{key}[{n}]", entry, low, high, whole) for n, entry in enumerate(value))
+
+    def span(self, key: str, low: float, high: float) -> tuple[float, float]:
+        """Return (least, most) of ``[least, most]``, or of one number that is both."""
+        if not isinstance(self.values.get(key), list):
+            value = self.number(key, low, high)
+            return value, value
+        least, most = self.numbers(key, low, high, 2)
+        if least > most:
+            raise self.problem(key, "[least, most]")
+        return least, most
+
+    def entries(self, key: str, expected: str) -> list[Any]:
+        """Return a list that is not empty, whatever its entries are."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or not value:
+            raise self.problem(key, expected)
+        return value
+
+    def table(self, key: str, known: Collection[str], default: Mapping[str, Any] | None = None) -> TomlTable:
+        """Return a table within this one."""
+        return TomlTable(self.values.get(key, default), known, self.error, self.path(key))
+
+    def tables(self, key: str, known: Collection[str]) -> list[TomlTable]:
+        """Return a list of tables within this one."""
+        value = self.values.get(key)
+        if not isinstance(value, list | tuple):
+            raise self.problem(key, f"a list of tables with: {', '.join(known)}")
+        return [TomlTable(entry, known, self.error, f"{self.path(key)}[{n}]") for n, entry in enumerate(value)]
+
+    def _number(self, key: str, value: object, low: float, high: float, whole: bool = False) -> float:
+        limits = f"from {low:.10g}" if high == math.inf else f"from {low:.10g} to {high:.10g}"
+        problem = f"{self.path(key)} is {'missing' if value is None else repr(value)}"
+        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+            raise self.error(f"{problem}, expected a {'whole ' * whole}number {limits}")
+        if math.isinf(value) or (whole and value % 1):
+            raise self.error(f"{problem}, expected a {'whole' if whole else 'finite'} number {limits}")
+        return int(value) if whole else float(value)
