@@ -1,4 +1,5 @@
 from .benchmark import bench as bench
+from .benchmark import write_suite_reports as write_suite_reports
 from .dataset.export import export_dataset as export_dataset
 from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
@@ -8,6 +9,8 @@ from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
 from .errors import KpbenchError as KpbenchError
+from .evaluate import compare_files as compare_files
+from .evaluate import score_file as score_file
 from .fitting.design_fit import fit as fit
 from .patches.board import Board as Board
 from .patches.board import grid_board as grid_board

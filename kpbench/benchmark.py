@@ -11,9 +11,10 @@ from __future__ import annotations
 import hashlib
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,14 @@ from kpbench.dataset.shard import canonical_json
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import detect_some
 from kpbench.errors import DataError
-from kpbench.files import check_own
+from kpbench.files import check_own, write_atomic
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
+from kpbench.report.figures import breakpoint_table, overview_table, paper_table
+from kpbench.report.paper import PAPER
+from kpbench.report.report import Report, write_report
+from kpbench.report.result_files import provenance, scores_file
+from kpbench.report.tables import Table
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.types import Predictions
@@ -57,6 +63,27 @@ class Benched:
     predictions: Path
     scores: Scores
     failures: tuple[tuple[int, str], ...]
+
+
+@dataclass(frozen=True)
+class SuiteReport:
+    """The results of one suite.
+
+    Attributes
+    ----------
+    suite : str
+    tables : tuple of Table
+        All detectors over all images, the paper's tables with our runs, and the breakpoints.
+    page : Path
+        The report (HTML).
+    scores : Path
+        Folder with one scores file per detector.
+    """
+
+    suite: str
+    tables: tuple[Table, ...]
+    page: Path
+    scores: Path
 
 
 @dataclass(frozen=True)
@@ -213,3 +240,43 @@ def _scored(config: SuiteConfig, dataset: Dataset, file: Path) -> Benched:
     predictions = read_predictions(file)
     failures = tuple((int(image_id), str(said)) for image_id, said in predictions.detector.get("failures", []))
     return Benched(config, dataset, file, score(dataset, predictions), failures)
+
+
+def write_suite_reports(
+    runs: Iterable[Benched], out: str | Path, *, command: Sequence[str] = ()
+) -> tuple[SuiteReport, ...]:
+    """Write a report per suite and a scores file per detector, and return the tables.
+
+    Parameters
+    ----------
+    runs : iterable of Benched
+        The result of :func:`bench`.
+    out : str or Path
+        Folder for ``SUITE.html``, ``SUITE.md`` and ``scores/SUITE/DETECTOR.json``.
+    command : sequence of str
+        The command line, for the provenance.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+    """
+    by_suite = groupby(runs, lambda run: run.config.suite.name)
+    return tuple(_write_suite_report(suite, tuple(part), Path(out), command) for suite, part in by_suite)
+
+
+def _write_suite_report(suite: str, runs: Sequence[Benched], out: Path, command: Sequence[str]) -> SuiteReport:
+    dataset, scores = runs[0].dataset, tuple(run.scores for run in runs)
+    known = provenance(dataset.path, dataset.fingerprint, [run.predictions for run in runs], command)
+    page = out / f"{suite}.html"
+    for path in (page, page.with_suffix(".md")):
+        write_report(path, Report(scores, dataset.config, provenance=known, title=f"{suite}, simulated"))
+    folder = out / "scores" / suite
+    folder.mkdir(parents=True, exist_ok=True)
+    for run in runs:
+        known = provenance(run.dataset.path, run.dataset.fingerprint, [run.predictions], command)
+        name = f"{run.predictions.stem.rpartition('-')[0]}.json"
+        write_atomic(folder / name, scores_file(run.scores, known | {"config": run.dataset.config}))
+    patches = [run.scores for run in runs if run.config.board is None]
+    tables = [paper_table(patches, PAPER[name]) for run in patches[:1] for name in run.conditions if name in PAPER]
+    return SuiteReport(suite, (overview_table(scores), *tables, breakpoint_table(scores)), page, folder)

@@ -39,12 +39,13 @@ def frail(image):
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """An empty folder with a module of detectors, which is the current one."""
+    """The current folder: empty but for a module of detectors."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.delitem(sys.modules, "mine", raising=False)
+    sys.modules.pop("mine", None)
     (tmp_path / "mine.py").write_text(DETECTOR)
-    return tmp_path
+    yield tmp_path
+    sys.modules.pop("mine", None)
 
 
 def files(folder):

@@ -1,6 +1,6 @@
 """Small SVG charts: lines with intervals, and stacked bars. They inherit the page's text colour.
 
-A chart inside a page needs :data:`STYLE` once in that page; :func:`standalone` makes a file of its own.
+A page with charts needs the style sheet :data:`STYLE` once.
 """
 
 from __future__ import annotations
@@ -145,12 +145,6 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
                 parts.append(f"{box}<title>{escape(text)}</title></rect>")
             x += wide
     return _svg(WIDTH, len(rows) * ROW, f"Shares of {', '.join(kinds)}", parts)
-
-
-def standalone(svg: str) -> str:
-    """A chart as an SVG file that needs no page, light or dark as its reader prefers."""
-    own = ":root{color:#1c1e21}@media (prefers-color-scheme:dark){:root{color:#e6e8eb}}"
-    return svg.replace(">", f' xmlns="http://www.w3.org/2000/svg"><style>{own}{STYLE}</style>', 1) + "\n"
 
 
 def _svg(width: float, height: float, label: str, parts: Iterable[str]) -> str:

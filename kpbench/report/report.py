@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
+from kpbench.files import write_atomic
 from kpbench.report.charts import STYLE
 from kpbench.report.figures import (
     Figure,
@@ -254,20 +255,34 @@ def _share(row: Sequence[Cell], cell: Cell) -> int:
     return round(100 * cell / total) if isinstance(cell, int) and total else 0
 
 
-WRITERS: dict[str, Callable[[Report], str]] = {".html": to_html, ".md": to_markdown_report, ".tex": to_latex_report}
+REPORT_WRITERS: dict[str, Callable[[Report], str]] = {
+    ".html": to_html,
+    ".md": to_markdown_report,
+    ".tex": to_latex_report,
+}
+"""The function that renders a report, by the suffix of its file."""
 
 
 def write_report(path: str | Path, report: Report) -> None:
-    """Write a report, whole or not at all; the suffix tells its form: .html, .md or .tex.
+    """Write a report, whole or not at all. The suffix of the path selects the form: .html, .md or .tex.
 
     Raises
     ------
     DataError
         If the suffix is another or the file cannot be written.
     """
-    from kpbench.files import write_atomic
-
     path = Path(path)
-    if path.suffix.lower() not in WRITERS:
-        raise DataError(f"{path}: unknown kind of report, expected {', '.join(WRITERS)}")
-    write_atomic(path, WRITERS[path.suffix.lower()](report).encode())
+    require_report_suffix(path)
+    write_atomic(path, REPORT_WRITERS[path.suffix.lower()](report).encode())
+
+
+def require_report_suffix(path: Path) -> None:
+    """Refuse a path whose suffix is that of no report.
+
+    Raises
+    ------
+    DataError
+        If the suffix is another than .html, .md and .tex.
+    """
+    if path.suffix.lower() not in REPORT_WRITERS:
+        raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_WRITERS)}")

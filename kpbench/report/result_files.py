@@ -6,38 +6,32 @@ import csv
 import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
+from kpbench import __version__
 from kpbench.files import sha256_of
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import breakpoints
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
 
-if TYPE_CHECKING:
-    from kpbench.dataset.folder import Dataset
-    from kpbench.predictions.coco import CocoDataset
-
-
 COMPARISON_SCHEMA = "kpbench.comparison/1"
 
 
-def provenance(
-    dataset: Dataset | CocoDataset, predictions: Sequence[Path], command: Sequence[str] = ()
-) -> dict[str, Any]:
-    """What numbers were made from and with: files with their SHA-256, fingerprint, versions; no time, no machine."""
-    from importlib.metadata import version
+def provenance(dataset: Path, fingerprint: str, predictions: Sequence[Path], command: Sequence[str]) -> dict[str, Any]:
+    """List what numbers were made from: the files with their SHA-256, the dataset, versions.
 
-    from kpbench import __version__
-
+    The time and the machine are left out, so that the same input gives the same bytes.
+    """
     return {
         "kpbench": __version__,
         "command": " ".join(command),
         "predictions": [{"file": str(path), "sha256": sha256_of(path)} for path in predictions],
-        "dataset": {"path": str(dataset.path), "fingerprint": dataset.fingerprint},
+        "dataset": {"path": str(dataset), "fingerprint": fingerprint},
         "versions": {name: version(name) for name in ("numpy", "scipy")},
     }
 

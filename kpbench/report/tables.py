@@ -1,10 +1,8 @@
-"""Tables as data, and as text: terminal, Markdown, CSV, LaTeX. HTML is made by :mod:`kpbench.report`."""
+"""Tables as data, and as text: terminal, Markdown, LaTeX. HTML is made by :mod:`kpbench.report`."""
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -77,25 +75,6 @@ def to_markdown(table: Table) -> str:
     return "\n".join([*lines, *(["", table.note] if table.note else []), ""])
 
 
-def to_csv(table: Table) -> str:
-    """All digits; a column of estimates becomes three: ``NAME``, ``NAME low``, ``NAME high``. Undefined is blank."""
-    wide = [any(isinstance(row[n], Estimate) for row in table.rows) for n in range(len(table.columns))]
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    names = (
-        [name, f"{name} low", f"{name} high"] if w else [name] for name, w in zip(table.columns, wide, strict=True)
-    )
-    writer.writerow([name for part in names for name in part])
-    for row in table.rows:
-        cells: list[Cell] = []
-        for cell, w in zip(row, wide, strict=True):
-            estimate = cell if isinstance(cell, Estimate) else None
-            value = cell.value if isinstance(cell, Estimate) else cell
-            cells += [value, *((estimate and estimate.interval) or (None, None))] if w else [value]
-        writer.writerow(cells)
-    return text.getvalue()
-
-
 LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "ε": r"$\varepsilon$"} | {
     c: f"\\{c}" for c in "&%$#_{}"
 }
@@ -128,7 +107,3 @@ def to_latex(table: Table) -> str:
             "",
         ]
     )
-
-
-WRITERS: dict[str, Callable[[Table], str]] = {".md": to_markdown, ".csv": to_csv, ".tex": to_latex}
-"""By the suffix of the file that a table goes to."""

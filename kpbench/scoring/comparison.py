@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,7 +123,7 @@ def _differences(first: Scores, second: Scores) -> Iterator[Difference]:
             yield Difference(condition, rung, name, a, b, None if a is None or b is None else spread[name])
 
 
-def check_regression(comparisons: list[Comparison]) -> None:
+def check_regression(comparisons: Sequence[Comparison]) -> None:
     """Refuse a first detector that is worse than another over all images, in any of the paper's three metrics.
 
     Raises

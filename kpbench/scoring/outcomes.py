@@ -231,6 +231,6 @@ def _image_of_detections(truth: Truth, predictions: Predictions, allow_missing: 
     if missing.any() and not allow_missing:
         raise PredictionsError(
             f"no prediction for image_id {ids[missing][0]}; {np.count_nonzero(missing)} of {len(ids)} images are "
-            f"missing (--allow-missing takes them as images without detections)"
+            f"missing (`allow_missing=True` takes them as images without detections)"
         )
     return np.repeat(order[place], np.diff(predictions.offsets))

@@ -1,0 +1,121 @@
+"""The command that scores a predictions file, and what it shares with the command that compares several."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from kpbench.cli.options import Finite
+
+
+class Limit(click.ParamType[tuple[str, float]]):
+    """``METRIC=VALUE``, as a tuple; the metric must exist."""
+
+    name = "METRIC=VALUE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        from kpbench.scoring.metrics import METRICS
+
+        if isinstance(value, tuple):
+            return value
+        metric, _, number = str(value).partition("=")
+        if metric not in METRICS:
+            self.fail(f"there is no metric {metric!r}, only {', '.join(METRICS)}", param, ctx)
+        try:
+            limit = float(number)
+        except ValueError:
+            limit = float("nan")
+        if limit != limit:
+            self.fail(f"{value!r} sets no limit, expected METRIC=VALUE such as {metric}=0.9", param, ctx)
+        return metric, limit
+
+
+class ReportFile(click.Path):
+    """A file whose suffix is that of a report."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        from kpbench.report.report import REPORT_WRITERS
+
+        if Path(value).suffix.lower() not in REPORT_WRITERS:
+            self.fail(f"{value}: expected a file ending in {', '.join(REPORT_WRITERS)}", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+FILE = click.Path(dir_okay=False, path_type=Path)
+
+
+def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that say what a match is, and against which truth."""
+    options = (
+        click.option(
+            "--gt",
+            "truth",
+            type=click.Path(path_type=Path),
+            help="Dataset, or COCO annotations (.json); else the one that the predictions name, else ./kpbench-data.",
+        ),
+        click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii."),
+        click.option(
+            "--eps-radius",
+            type=click.Choice(["major", "minor", "mean"]),
+            default="major",
+            show_default=True,
+            help="Which semi-axis of a tilted disc --eps is a share of.",
+        ),
+        click.option(
+            "--matching",
+            type=click.Choice(["one-to-one", "literal"]),
+            default="one-to-one",
+            show_default=True,
+            help="literal: the paper's formulas as printed, where several detections of a keypoint all count.",
+        ),
+        click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections."),
+        click.option(
+            "--report",
+            "report_file",
+            type=ReportFile(dir_okay=False, path_type=Path),
+            help="Write tables and charts: .html (one offline page), .md, .tex.",
+        ),
+    )
+    for option in reversed(options):
+        command = option(command)
+    return command
+
+
+def print_warning(message: str) -> None:
+    """Print one line to stderr."""
+    click.echo(f"kpbench: {message}", err=True)
+
+
+@click.command()
+@click.argument("preds", type=FILE)
+@scoring_options
+@click.option("--json", "json_file", type=FILE, help="Write all scores.")
+@click.option("--csv", "csv_file", type=FILE, help="Write one row per condition, rung and patch.")
+@click.option("--pose", is_flag=True, help="Errors of the board's pose too; for the datasets of a suite.")
+@click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
+@click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")
+def score(
+    preds: Path, least: tuple[tuple[str, float], ...], most: tuple[tuple[str, float], ...], **arguments: Any
+) -> None:
+    """Score a predictions file (.json, .jsonl, .csv, .parquet, .h5) against a dataset's true keypoints.
+
+    \b
+    Examples:
+      kpbench score preds.json
+      kpbench score preds.json --report report.html
+      kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
+    """
+    from kpbench.evaluate import score_file
+    from kpbench.report.summary import summarise_scores
+    from kpbench.scoring.scores import check_gates
+
+    scored = score_file(preds, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
+    scores, dataset = scored.scores, scored.dataset
+    click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
+    click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
+    click.echo(summarise_scores(scores, scored.poses))
+    check_gates(scores, dict(least), dict(most))

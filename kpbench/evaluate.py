@@ -1,0 +1,304 @@
+"""Score predictions files: read predictions and truth, score or compare them, write the results and a report."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, Protocol, TypedDict, Unpack
+
+from kpbench.dataset.folder import MANIFEST, open_dataset
+from kpbench.errors import DataError, PredictionsError
+from kpbench.files import check_targets, write_atomic
+from kpbench.predictions.coco import open_coco
+from kpbench.predictions.files import read_predictions
+from kpbench.report.figures import pose_table
+from kpbench.report.report import Report, require_report_suffix, write_report
+from kpbench.report.result_files import comparison_file, provenance, scores_csv, scores_file
+from kpbench.scoring.board_pose import PoseGroup, pose_errors, pose_groups
+from kpbench.scoring.comparison import Comparison, compare
+from kpbench.scoring.scores import Scores, score
+from kpbench.types import Predictions, Truth, UInt8
+
+DEFAULT_DATASET = Path("kpbench-data")
+"""The folder that ``kpbench synth`` writes by default. It is the truth where neither user nor file names a dataset."""
+MOST_CASES = 12
+"""Number of images in a report's gallery of failures, shared by its detectors."""
+
+
+class LabelledImages(Protocol):
+    """A dataset as scoring and reports need it: a :class:`kpbench.Dataset`, COCO annotations, or a class of yours."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the dataset, or its annotations file."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the dataset, 64 hexadecimal digits."""
+        ...
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """How the images were made and the names of the patches; may be empty."""
+        ...
+
+    @property
+    def truth(self) -> Truth:
+        """The true keypoints of all images."""
+        ...
+
+    def image(self, index: int) -> UInt8:
+        """Read the image at a position of the truth, of shape (H, W) or (H, W, 3).
+
+        Raises
+        ------
+        DataError
+            If the image cannot be read.
+        """
+        ...
+
+
+class ScoreOptions(TypedDict, total=False):
+    """The keyword arguments of :func:`kpbench.score`."""
+
+    eps: float
+    eps_radius: Literal["major", "minor", "mean"]
+    matching: Literal["one-to-one", "literal"]
+    allow_missing: bool
+    resamples: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class ScoredFile:
+    """The result of :func:`score_file`.
+
+    Attributes
+    ----------
+    scores : Scores
+    dataset : LabelledImages
+        The dataset that the predictions were scored against.
+    poses : tuple of PoseGroup
+        Errors of the board's pose; empty unless `pose` was set.
+    provenance : dict
+        Files, digests and versions behind the numbers.
+    """
+
+    scores: Scores
+    dataset: LabelledImages
+    poses: tuple[PoseGroup, ...]
+    provenance: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class ComparedFiles:
+    """The result of :func:`compare_files`.
+
+    Attributes
+    ----------
+    comparisons : tuple of Comparison
+        The first file against each of the others.
+    scores : tuple of Scores
+        The scores of each file.
+    dataset : LabelledImages
+        The dataset that all files were scored against.
+    provenance : dict
+        Files, digests and versions behind the numbers.
+    """
+
+    comparisons: tuple[Comparison, ...]
+    scores: tuple[Scores, ...]
+    dataset: LabelledImages
+    provenance: dict[str, Any]
+
+
+def score_file(
+    predictions: str | Path,
+    truth: str | Path | LabelledImages | None = None,
+    *,
+    pose: bool = False,
+    json_file: str | Path | None = None,
+    csv_file: str | Path | None = None,
+    report_file: str | Path | None = None,
+    command: Sequence[str] = (),
+    warn: Callable[[str], None] = warnings.warn,
+    **options: Unpack[ScoreOptions],
+) -> ScoredFile:
+    """Score a predictions file and write the results to files.
+
+    Parameters
+    ----------
+    predictions : str or Path
+        File ending in .json, .jsonl, .csv, .parquet or .h5.
+    truth : str, Path, LabelledImages or None
+        Folder of a dataset, COCO annotations (.json) or an open dataset. None takes the dataset that the predictions
+        name, else the folder ``kpbench-data``.
+    pose : bool
+        Whether to compute errors of the board's pose too. The dataset must be that of a suite.
+    json_file, csv_file, report_file : str, Path or None
+        Files to write: all scores, one row per group, and a report (.html, .md or .tex).
+    command : sequence of str
+        The command line, for the provenance.
+    warn : function
+        Called with a line of text if images of the report or the dataset named by the predictions are missing.
+    **options
+        The keyword arguments of :func:`kpbench.score`, such as ``eps=0.2``.
+
+    Returns
+    -------
+    ScoredFile
+
+    Raises
+    ------
+    PredictionsError
+        If the predictions cannot be read or do not fit the dataset.
+    DataError
+        If the dataset cannot be read, `pose` is set and the dataset shows no board, or a file cannot be written.
+    """
+    path, (to_json, to_csv, to_report) = Path(predictions), map(_as_path, (json_file, csv_file, report_file))
+    _check_targets([path], [to_json, to_csv], to_report)
+    dataset, [scores] = _score_files([path], truth, warn, options)
+    poses = _pose_groups(scores, dataset) if pose else ()
+    known = provenance(dataset.path, dataset.fingerprint, [path], command)
+    if to_json:
+        write_atomic(to_json, scores_file(scores, known, poses))
+    if to_csv:
+        write_atomic(to_csv, scores_csv(scores, known))
+    if to_report:
+        _write_report(to_report, [scores], dataset, known, warn, poses=poses)
+    return ScoredFile(scores, dataset, poses, known)
+
+
+def compare_files(
+    predictions: Sequence[str | Path],
+    truth: str | Path | LabelledImages | None = None,
+    *,
+    json_file: str | Path | None = None,
+    report_file: str | Path | None = None,
+    command: Sequence[str] = (),
+    warn: Callable[[str], None] = warnings.warn,
+    **options: Unpack[ScoreOptions],
+) -> ComparedFiles:
+    """Compare the first of several predictions files with each of the others, on the same truth.
+
+    Parameters
+    ----------
+    predictions : sequence of str or Path
+        Two or more predictions files.
+    truth, command, warn, **options
+        As for :func:`score_file`. None as `truth` takes the dataset that the first file names.
+    json_file, report_file : str, Path or None
+        Files to write: all differences, and a report (.html, .md or .tex).
+
+    Returns
+    -------
+    ComparedFiles
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than two files.
+    PredictionsError, DataError
+        As by :func:`score_file`.
+    """
+    if len(predictions) < 2:
+        raise ValueError(f"{len(predictions)} predictions files, expected two or more")
+    paths, to_json, to_report = [Path(file) for file in predictions], _as_path(json_file), _as_path(report_file)
+    _check_targets(paths, [to_json], to_report)
+    dataset, scores = _score_files(paths, truth, warn, options)
+    comparisons = tuple(compare(scores[0], other) for other in scores[1:])
+    known = provenance(dataset.path, dataset.fingerprint, paths, command)
+    if to_json:
+        write_atomic(to_json, comparison_file(comparisons, known))
+    if to_report:
+        _write_report(to_report, scores, dataset, known, warn, comparisons)
+    return ComparedFiles(comparisons, tuple(scores), dataset, known)
+
+
+def _as_path(file: str | Path | None) -> Path | None:
+    return None if file is None else Path(file)
+
+
+def _check_targets(sources: Sequence[Path], targets: Sequence[Path | None], report: Path | None) -> None:
+    """Refuse files that cannot be written, before any work is done."""
+    if report:
+        require_report_suffix(report)
+    check_targets([*targets, report], sources)
+
+
+def _score_files(
+    files: Sequence[Path],
+    truth: str | Path | LabelledImages | None,
+    warn: Callable[[str], None],
+    options: ScoreOptions,
+) -> tuple[LabelledImages, list[Scores]]:
+    """Score all files against the dataset of the first. The file's name tells detectors of equal names apart."""
+    predictions = [read_predictions(path) for path in files]
+    dataset = _find_dataset(predictions[0], files[0], truth, warn)
+    scores: list[Scores] = []
+    for path, found in zip(files, predictions, strict=True):
+        try:
+            scores.append(score(dataset, found, **options))
+        except PredictionsError as error:
+            raise PredictionsError(f"{path} does not fit {dataset.path}: {error}") from None
+    names = [run.name for run in scores]
+    return dataset, [
+        replace(run, name=f"{run.name} {path}") if names.count(run.name) > 1 else run
+        for run, path in zip(scores, files, strict=True)
+    ]
+
+
+def _find_dataset(
+    predictions: Predictions, file: Path, truth: str | Path | LabelledImages | None, warn: Callable[[str], None]
+) -> LabelledImages:
+    """Open the dataset that the user names, else the one that the file names, else ``kpbench-data``."""
+    if truth is not None:
+        if not isinstance(truth, str | Path):
+            return truth
+        path = Path(truth)
+        return open_coco(path) if path.suffix.lower() == ".json" and path.name != MANIFEST else open_dataset(truth)
+    named = predictions.dataset
+    for folder in (Path(named), file.parent / named) if named else ():
+        if folder.exists():
+            return open_dataset(folder)
+    problem = f"names the dataset {named!r}, which is not here" if named else "names no dataset"
+    if not DEFAULT_DATASET.exists():
+        raise PredictionsError(f"{file}: {problem}, and there is no ./{DEFAULT_DATASET}; name one with `truth`")
+    if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint names a dataset but no place
+        warn(f"{file} {problem}; scoring against ./{DEFAULT_DATASET}")
+    return open_dataset(DEFAULT_DATASET)
+
+
+def _pose_groups(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
+    from kpbench.synth.suite import board_in_view  # here, because few need it and it loads OpenCV
+
+    view = board_in_view(dataset.config)
+    if view is None:
+        raise DataError(f"{dataset.path}: shows no known board, `pose=True` needs the dataset of a suite")
+    return pose_groups(scores, pose_errors(scores.tally, *view))
+
+
+def _write_report(
+    path: Path,
+    runs: Sequence[Scores],
+    dataset: LabelledImages,
+    known: Mapping[str, Any],
+    warn: Callable[[str], None],
+    comparisons: Sequence[Comparison] = (),
+    poses: Sequence[PoseGroup] = (),
+) -> None:
+    from kpbench.report.worst_cases import Case, worst_cases  # here, because it loads OpenCV
+
+    cases: tuple[tuple[Case, ...], ...] = ()
+    if path.suffix.lower() == ".html":
+        try:
+            cases = tuple(worst_cases(run.tally, dataset.image, MOST_CASES // len(runs) or 1) for run in runs)
+        except DataError as error:
+            warn(f"{path} shows no images: {error}")
+    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
+    tables = (pose_table(runs[0], poses),) if poses else ()
+    write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), tables, title))

@@ -1,0 +1,54 @@
+"""Scores and comparisons as plain text, for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from kpbench.report.figures import difference_table, group_table, pose_table, verdict_table
+from kpbench.report.tables import Estimate, Table, cell_text, to_plain
+from kpbench.scoring.board_pose import PoseGroup
+from kpbench.scoring.comparison import Comparison
+from kpbench.scoring.metrics import LABELS, PAPER_METRICS
+from kpbench.scoring.scores import Scores
+
+
+def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
+    """Write the settings, counts and metrics of a detector, and its tables of IDs, groups and poses.
+
+    The paper's formulas as printed are left out where they give the same numbers in all groups.
+    """
+    overall, settings = scores.overall, scores.settings
+    groups = (overall, *scores.by)
+    hidden = {f"{m}_literal" for m in PAPER_METRICS if all(g.metrics[m] == g.metrics[f"{m}_literal"] for g in groups)}
+    n = {name: cell_text(value) for name, value in overall.counts.items()}
+    lines = [
+        f"match        at most {settings.eps:g} of the {settings.eps_radius} radius, {settings.matching}",
+        f"images       {n['images']} in {n['scenes']} scenes, which the 95 % intervals resample",
+        f"keypoints    {n['truths']}: {n['matched']} matched ({n['wrong_id']} with a wrong ID), {n['missed']} missed",
+        f"detections   {n['detections']}: {n['matched']} matched, {n['duplicate']} duplicates, "
+        f"{n['near_miss']} near misses, {n['clutter']} clutter",
+        "",
+    ]
+    for name, label in LABELS.items():
+        if name not in hidden:
+            estimate = Estimate(overall.metrics[name], overall.intervals.get(name))
+            lines.append(f"{label:<30} {cell_text(estimate, 4)}")
+    if scores.confusion and any(sum(row) for row in scores.confusion["matrix"]):
+        ids = [str(i) for i in scores.confusion["ids"]]
+        matrix = tuple((i, *row) for i, row in zip(ids, scores.confusion["matrix"], strict=True))
+        lines += ["", "ID of matched detections: true in rows, detected in columns"]
+        lines.append(to_plain(Table("", ("", *ids, "other"), matrix)))
+    if scores.by:
+        lines += ["", to_plain(group_table(scores.by, "", errors=["error_median_px"]), 4)]
+    if poses:
+        lines += ["", _with_title(pose_table(scores, poses))]
+    return "\n".join(lines)
+
+
+def summarise_comparisons(comparisons: Sequence[Comparison]) -> str:
+    """Write who is better than whom, and all differences."""
+    return "\n\n".join(map(_with_title, (verdict_table(comparisons), *map(difference_table, comparisons))))
+
+
+def _with_title(table: Table) -> str:
+    return f"{table.title}\n{to_plain(table)}"
