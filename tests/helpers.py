@@ -1,11 +1,26 @@
-"""What tests of several rooms make."""
+"""What tests of several rooms make and call."""
 
 import numpy as np
+from click.testing import CliRunner
 
+from kpbench.cli import main
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.files import sha256_of, write_atomic
 from kpbench.types import KEYPOINT_DTYPE
+
+
+def kpbench(*arguments, code=0):
+    """Run a command in this process and return its result; it must end with this exit code, by no stray exception."""
+    result = CliRunner().invoke(main, [str(argument) for argument in arguments])
+    assert isinstance(result.exception, SystemExit | None), result.exception
+    assert result.exit_code == code, result.output
+    return result
+
+
+def digests(folder):
+    """SHA-256 of each file of a folder, by name."""
+    return {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 
 def write_dataset(folder, images, condition="", seed=0):

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import cv2
 import pytest
-from click.testing import CliRunner
+from helpers import kpbench
 
 from kpbench.benchmark import bench, images_to_do
-from kpbench.cli import main
 from kpbench.detectors import interface as detect
 from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
@@ -38,13 +37,12 @@ def frail(image):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(here, monkeypatch):
     """The current folder: empty but for a module of detectors."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.syspath_prepend(str(here))
     sys.modules.pop("mine", None)
-    (tmp_path / "mine.py").write_text(DETECTOR)
-    yield tmp_path
+    (here / "mine.py").write_text(DETECTOR)
+    yield here
     sys.modules.pop("mine", None)
 
 
@@ -120,8 +118,7 @@ def test_version_settings_and_weights_are_what_a_detector_is(tmp_path):
 def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
     arguments = ["--images", 1, "--size", "203x155", "--only", "blur,noise", "--workers", 1, "--out", "out"]
     arguments += ["--detector", "mine:frail", "--detector", "mine:corners"]
-    done = CliRunner().invoke(main, ["bench", *map(str, arguments)])
-    assert done.exit_code == 1, done.output
+    done = kpbench("bench", *arguments, code=1)
     scores = json.loads((here / "out/scores/paper-v1/mine-frail.json").read_text())
     failures = scores["detector"]["failures"]
     assert 0 < len(failures) < 32
@@ -142,8 +139,7 @@ def test_a_detector_that_raises_is_named_and_counted_and_the_rest_goes_on(here):
 
 def test_the_command_tells_the_difference_to_the_paper(here):
     arguments = ["--images", "1", "--size", "203x155", "--only", "blur", "--workers", "1", "--out", "out"]
-    done = CliRunner().invoke(main, ["bench", *arguments, "--detector", "mine:corners"])
-    assert done.exit_code == 0, done.output
+    done = kpbench("bench", *arguments, "--detector", "mine:corners")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "|" in line]
     paper = next(row for row in rows if row[:2] == ["detection", "paper"])
     ours = next(row for row in rows if row[:2] == ["detection", "mine:corners 1"])
@@ -151,7 +147,7 @@ def test_the_command_tells_the_difference_to_the_paper(here):
     assert paper[2:] == ["photographs", "1.000", "0.986", "0.882", "0.605"]
     for theirs, value, between in zip(paper[3:], ours[3:], less[3:], strict=True):
         assert abs(float(value.split()[0]) - float(theirs) - float(between.split()[0])) < 0.0011
-    assert CliRunner().invoke(main, ["bench", "--quick", "--images", "3"]).exit_code == 2
+    kpbench("bench", "--quick", "--images", 3, code=2)
 
 
 def test_two_detectors_of_one_name_are_refused(here):
@@ -212,8 +208,7 @@ def test_a_program_that_does_not_do_its_work_is_one_line(here, code, says):
 
 
 def test_two_suites_of_one_name_are_refused(here):
-    refused = CliRunner().invoke(main, ["bench", "--suite", "paper-v1", "--suite", "paper-v1", "--quick"])
-    assert refused.exit_code == 2
+    refused = kpbench("bench", "--suite", "paper-v1", "--suite", "paper-v1", "--quick", code=2)
     assert "suites of one name, paper-v1, paper-v1" in refused.output
 
 
@@ -222,7 +217,6 @@ def test_a_folder_of_other_files_is_left_alone(here):
     (here / "photos" / "scores.json").write_text("mine")
     with pytest.raises(DataError, match=r"photos: holds other files \(scores.json"):
         bench([SMALL], ["aruco"], "photos")
-    refused = CliRunner().invoke(main, ["demo", "--n", "1", "--out", "photos"])
-    assert refused.exit_code == 1
+    refused = kpbench("demo", "--n", 1, "--out", "photos", code=1)
     assert "photos: holds other files (scores.json, ...), expected a new or an empty folder" in refused.output
     assert [path.name for path in (here / "photos").iterdir()] == ["scores.json"]

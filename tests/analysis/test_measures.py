@@ -1,12 +1,9 @@
 import dataclasses
 import itertools
-import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -15,7 +12,6 @@ import kpbench
 from kpbench.analysis import measures as analysis
 from kpbench.analysis import search
 from kpbench.analysis.cell_images import Grid, attitudes, images, seen_cells
-from kpbench.cli import main
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import coverage
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
@@ -274,50 +270,3 @@ def test_the_search_prefers_the_shipped_designs(family, monkeypatch):
     assert found.sets[0] == kpbench.shipped_patches()
     assert list(found.counts.values()) == [9, 9, 7, 6, 5, 5, 5]
     assert found.distances[0][0] > 0.16
-
-
-# --- Command line -------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def quick(monkeypatch):
-    """Fewer sizes and windows: what is printed, not what is measured."""
-    monkeypatch.setattr(analysis, "SIZES_PX", (5.0, 8.0))
-    monkeypatch.setattr(analysis, "SEEN_BASIN", (1.0,))
-    monkeypatch.setattr(analysis.sample_windows, "__defaults__", (400,))
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, ["analyze-patches", *(str(a) for a in arguments)])
-
-
-def test_table_json_and_figure(quick, tmp_path):
-    files = [DESIGNS / "alternatives" / f"{name}.toml" for name in ("half", "quarter")]
-    done = run(*files, "--json", tmp_path / "a.json", "--figure", tmp_path / "a.svg")
-    assert done.exit_code == 0, done.output
-    assert re.search(r"0 half +0\.03\d+ +0\.02\d+ .* inf\n", done.stdout)
-    assert re.search(r"1 quarter +yes +0\.00 ", done.stdout)
-    table = json.loads((tmp_path / "a.json").read_text())
-    assert table["schema"] == "kpbench.analysis/1"
-    assert table["designs"][0]["bound_without_rim_px"] is None
-    assert len(table["distance"]) == 2
-    drawn = (tmp_path / "a.svg").read_text()
-    assert "1 quarter" in drawn
-    assert "no crossing, unique orientation" in drawn
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "says"),
-    [
-        (["nowhere.toml"], 1, "nowhere.toml: cannot be read"),
-        (["--backgrounds", "nowhere"], 1, "nowhere: no such folder of background images"),
-        (["--search", "a.toml"], 2, "--search goes through a whole family of designs and takes no FILES"),
-        (["--figure", "a.gif"], 2, "--figure a.gif: expected a file that ends in .svg, .png or .pdf"),
-    ],
-)
-def test_bad_input(arguments, code, says, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = run(*arguments)
-    assert done.exit_code == code
-    assert done.stdout == ""
-    assert says in done.stderr

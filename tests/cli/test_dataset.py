@@ -4,33 +4,26 @@ import sys
 
 import cv2
 import pytest
-from click.testing import CliRunner
+from helpers import kpbench
 
-from kpbench.cli import COMMANDS, main
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
+from kpbench.cli import COMMANDS
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
     folder = tmp_path_factory.mktemp("made") / "set"
-    result = run("synth", "--n", 6, "--size", "160x120", "--out", folder, "--workers", 1)
-    assert result.exit_code == 0, result.output
+    result = kpbench("synth", "--n", 6, "--size", "160x120", "--out", folder, "--workers", 1)
     assert "6 images, 1 shards, fingerprint" in result.stdout
     return folder
 
 
 def test_inspect_verify_and_preview(dataset, tmp_path):
-    told = run("inspect", dataset)
-    assert told.exit_code == 0
+    told = kpbench("inspect", dataset)
     assert "6 of 160x120, grey" in told.stdout
-    checked = run("verify", dataset)
-    assert checked.exit_code == 0
+    checked = kpbench("verify", dataset)
     assert "all as written" in checked.stdout
     sheet = tmp_path / "sheet.png"
-    assert run("preview", dataset, "--out", sheet, "--count", 4, "--columns", 2, "--tile-width", 160).exit_code == 0
+    kpbench("preview", dataset, "--out", sheet, "--count", 4, "--columns", 2, "--tile-width", 160)
     assert cv2.imread(str(sheet)).shape == (2 * 124 + 4, 2 * 164 + 4, 3)
 
 
@@ -45,10 +38,8 @@ def test_inspect_verify_and_preview(dataset, tmp_path):
         (["preview", "nowhere"], "nowhere: no dataset there"),
     ],
 )
-def test_bad_input_is_one_line_and_exit_code_1(arguments, says, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    result = run(*arguments)
-    assert result.exit_code == 1
+def test_bad_input_is_one_line_and_exit_code_1(arguments, says, here):
+    result = kpbench(*arguments, code=1)
     assert result.stdout == ""
     assert result.stderr.startswith("kpbench: ")
     assert says in result.stderr
@@ -59,23 +50,18 @@ def test_designs_of_ones_own(tmp_path):
     design = 'name = "half"\nid = 7\nsemicircles = [{ start_deg = 90, ink = "black" }]\n'
     (tmp_path / "half.toml").write_text(design)
     for given in (tmp_path, tmp_path / "half.toml"):
-        result = run(
-            "synth", "--n", 4, "--size", "160x120", "--patches", given, "--out", tmp_path / "set", "--overwrite"
-        )
-        assert result.exit_code == 0, result.output
-        told = run("inspect", tmp_path / "set").stdout
+        kpbench("synth", "--n", 4, "--size", "160x120", "--patches", given, "--out", tmp_path / "set", "--overwrite")
+        told = kpbench("inspect", tmp_path / "set").stdout
         ids = told.partition("patch ID\n")[2].partition("radius")[0].split("\n")
         assert [line.split()[0] for line in ids if line] == ["7"]
     (tmp_path / "empty").mkdir()
-    refused = run("synth", "--n", 4, "--patches", tmp_path / "empty", "--out", tmp_path / "other")
-    assert refused.exit_code == 1
+    refused = kpbench("synth", "--n", 4, "--patches", tmp_path / "empty", "--out", tmp_path / "other", code=1)
     assert "empty: no designs in it" in refused.stderr
 
 
 def test_a_second_synth_into_the_folder_changes_nothing(dataset):
     before = (dataset / "dataset.json").read_bytes()
-    result = run("synth", "--n", 7, "--out", dataset)
-    assert result.exit_code == 1
+    result = kpbench("synth", "--n", 7, "--out", dataset, code=1)
     assert "already holds a dataset; add --resume" in result.stderr
     assert (dataset / "dataset.json").read_bytes() == before
 
@@ -84,13 +70,12 @@ def test_a_second_synth_into_the_folder_changes_nothing(dataset):
     "arguments", [["synth"], ["synth", "--n", "1", "--size", "big"], ["synth", "--n", "1", "--resume", "--overwrite"]]
 )
 def test_wrong_usage_is_exit_code_2(arguments):
-    assert run(*arguments).exit_code == 2
+    kpbench(*arguments, code=2)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_has_help_with_an_example(command):
-    result = run(command, "--help")
-    assert result.exit_code == 0
+    result = kpbench(command, "--help")
     assert "Example" in result.stdout
     assert f"kpbench {command}" in result.stdout
 
@@ -114,7 +99,7 @@ def test_without_a_terminal_stderr_stays_empty(tmp_path):
     ],
 )
 def test_numbers_that_are_none_are_wrong_usage(arguments):
-    assert run(*arguments).exit_code == 2
+    kpbench(*arguments, code=2)
 
 
 def test_a_full_standard_output_is_one_line(dataset):

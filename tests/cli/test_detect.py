@@ -7,9 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from helpers import kpbench
 
-from kpbench.cli import main
 from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.generation import generate
 from kpbench.detectors.interface import LoadedDetector, load_detector
@@ -46,20 +45,15 @@ class Unsure:
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    (tmp_path / f"plug_{abs(hash(str(tmp_path)))}.py").write_text(MODULE)
-    return tmp_path
+def folder(here, monkeypatch):
+    monkeypatch.syspath_prepend(str(here))
+    (here / f"plug_{abs(hash(str(here)))}.py").write_text(MODULE)
+    return here
 
 
 @pytest.fixture
 def plug(folder):
     return next(folder.glob("plug_*.py")).stem
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, ["detect", *[str(a) for a in arguments]])
 
 
 def photos(folder, count=3):
@@ -72,8 +66,7 @@ def photos(folder, count=3):
 
 def test_a_dataset_gets_predictions_that_name_it(folder, plug):
     data = generate(SynthConfig(4, size_px=(160, 120)), "set", workers=1).dataset
-    result = run("set", "--detector", f"{plug}:brightest", "--workers", 1, "--overlay", "drawn")
-    assert result.exit_code == 0, result.output
+    result = kpbench("detect", "set", "--detector", f"{plug}:brightest", "--workers", 1, "--overlay", "drawn")
     assert "preds.json: 8 detections in 4 images" in result.stdout
     found = read_predictions("preds.json")
     assert found.dataset == "set"
@@ -85,14 +78,13 @@ def test_a_dataset_gets_predictions_that_name_it(folder, plug):
 def test_workers_change_nothing(folder, plug):
     generate(SynthConfig(40, size_px=(96, 96)), "set", workers=1)
     for n in (1, 2):
-        assert run("set", "--detector", f"{plug}:brightest", "--workers", n, "--out", f"{n}.json").exit_code == 0
+        kpbench("detect", "set", "--detector", f"{plug}:brightest", "--workers", n, "--out", f"{n}.json")
     assert (folder / "1.json").read_bytes() == (folder / "2.json").read_bytes()
 
 
 def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
     photos(folder)
-    result = run("photos", "--detector", f"{plug}:brightest", "--threshold", 0.5, "--overlay", "drawn")
-    assert result.exit_code == 0, result.output
+    kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--threshold", 0.5, "--overlay", "drawn")
     assert read_predictions("preds.json").xy.tolist() == [[20, 10], [20, 11], [20, 12]]
     assert sorted(p.relative_to(folder / "drawn").as_posix() for p in (folder / "drawn").rglob("*.png")) == [
         "0.png",
@@ -104,7 +96,7 @@ def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
 def test_a_threshold_takes_the_place_of_the_detectors_own(folder, plug):
     photos(folder, 1)
     for threshold, count in ([], 1), (["--threshold", 0.1], 2), (["--threshold", 1.1], 0):
-        assert f"{count} detections" in run("photos", "--detector", f"{plug}:Unsure", *threshold).stdout
+        assert f"{count} detections" in kpbench("detect", "photos", "--detector", f"{plug}:Unsure", *threshold).stdout
 
 
 @pytest.mark.parametrize("name", ["template", "superpoint", "superpoint-small"])
@@ -116,11 +108,9 @@ def test_one_image_is_drawn_into_one_file_and_more_into_a_folder(folder, plug):
     (folder / "two").mkdir()
     for n in range(2):
         cv2.imwrite(str(folder / "two" / f"{n}.png"), np.full((24, 32), 90, np.uint8))
-    result = run("two/0.png", "--detector", f"{plug}:brightest", "--overlay", "drawn.png")
-    assert result.exit_code == 0
+    kpbench("detect", "two/0.png", "--detector", f"{plug}:brightest", "--overlay", "drawn.png")
     assert cv2.imread("drawn.png").shape == (24, 32, 3)
-    refused = run("two", "--detector", f"{plug}:brightest", "--overlay", "other.png")
-    assert refused.exit_code == 1
+    refused = kpbench("detect", "two", "--detector", f"{plug}:brightest", "--overlay", "other.png", code=1)
     assert "there is more than one image, expected a folder" in refused.output
 
 
@@ -131,8 +121,7 @@ def test_a_video_and_its_overlay(folder, plug):
         cv2.rectangle(frame, (10 + 8 * n, 20), (20 + 8 * n, 30), (255, 255, 255), -1)
         writer.write(frame)
     writer.release()
-    result = run("in.mp4", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", "--threshold", 0.5)
-    assert result.exit_code == 0, result.output
+    kpbench("detect", "in.mp4", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", "--threshold", 0.5)
     x = read_predictions("preds.json").xy[:, 0]
     assert len(x) == 5
     assert (np.abs(x - (15 + 8 * np.arange(5))) <= 8).all()
@@ -155,8 +144,7 @@ def test_an_image_that_fails_is_named_and_counted_and_the_rest_goes_on(folder, p
     photos(folder)
     (folder / "photos" / "broken.jpg").write_bytes(b"nothing")
     cv2.imwrite(str(folder / "photos" / "even.png"), np.full((40, 40, 3), 2, np.uint8))
-    result = run("photos", "--detector", f"{plug}:moody")
-    assert result.exit_code == 1
+    result = kpbench("detect", "photos", "--detector", f"{plug}:moody", code=1)
     assert "broken.jpg: cannot be decoded" in result.stderr
     assert "0.png: RuntimeError: not today" in result.stderr
     assert "4 images failed" in result.stderr
@@ -178,8 +166,7 @@ def test_bad_sources_are_one_line(folder, plug, source, says):
     (folder / "empty").mkdir()
     (folder / "text.png").write_text("no image")
     (folder / "text.mp4").write_text("no video")
-    result = run(source, "--detector", f"{plug}:brightest")
-    assert result.exit_code == 1
+    result = kpbench("detect", source, "--detector", f"{plug}:brightest", code=1)
     assert result.stderr.startswith(f"kpbench: {says}")
     assert result.stderr.count("\n") == 1
 
@@ -187,10 +174,9 @@ def test_bad_sources_are_one_line(folder, plug, source, says):
 def test_predictions_for_another_dataset_are_refused_by_its_fingerprint(folder, plug):
     for seed in (0, 1):
         generate(SynthConfig(4, seed=seed, size_px=(160, 120)), f"set-{seed}", workers=1)
-    assert run("set-0", "--detector", f"{plug}:brightest", "--workers", 1).exit_code == 0
-    assert CliRunner().invoke(main, ["score", "preds.json"]).exit_code == 0
-    refused = CliRunner().invoke(main, ["score", "preds.json", "--gt", "set-1"])
-    assert refused.exit_code == 1
+    kpbench("detect", "set-0", "--detector", f"{plug}:brightest", "--workers", 1)
+    kpbench("score", "preds.json")
+    refused = kpbench("score", "preds.json", "--gt", "set-1", code=1)
     assert "made for the dataset with fingerprint" in refused.stderr
     assert refused.stderr.count("\n") == 1
 
@@ -212,8 +198,7 @@ def test_mistakes_in_a_detector_of_ones_own_are_one_line_and_keep_older_predicti
     (folder / "preds.json").write_text("earlier")
     name = f"bad_{abs(hash((str(folder), code)))}"
     (folder / f"{name}.py").write_text(code)
-    result = run("photos", "--detector", f"{name}:f")
-    assert result.exit_code == 1
+    result = kpbench("detect", "photos", "--detector", f"{name}:f", code=1)
     assert says in result.stderr
     assert result.stderr.count("\n") == 1
     assert (folder / "preds.json").read_text() == "earlier"
@@ -225,12 +210,11 @@ def test_template_looks_for_the_designs_it_is_told(folder):
     generate(
         SynthConfig(4, size_px=(160, 120), deteriorate="none", patches=load_patches([other]), limits=limits), "set"
     )
-    assert run("set", "--patches", other).exit_code == 0
+    kpbench("detect", "set", "--patches", other)
     ids = read_predictions("preds.json").patch_id
     assert len(ids) >= 3
     assert set(ids) == {4}
-    refused = run("set", "--patches", other, "--detector", "superpoint-small")
-    assert refused.exit_code == 2
+    refused = kpbench("detect", "set", "--patches", other, "--detector", "superpoint-small", code=2)
     assert "--patches is for the template detector" in refused.stderr
 
 
@@ -238,21 +222,23 @@ def test_photographs_are_not_drawn_over_and_drawings_not_read(folder, plug):
     photos(folder)
     before = {path: path.read_bytes() for path in (folder / "photos").rglob("*.png")}
     for source, overlay in ("photos", "photos"), ("photos/0.png", "photos/0.png"), ("photos/0.png", "photos"):
-        refused = run(source, "--detector", f"{plug}:brightest", "--overlay", overlay)
-        assert refused.exit_code == 1
+        refused = kpbench("detect", source, "--detector", f"{plug}:brightest", "--overlay", overlay, code=1)
         assert (
             refused.stderr
             == f"kpbench: {overlay}: holds the images themselves, which would be overwritten; name another place\n"
         )
     for _ in range(2):
-        assert "in 3 images" in run("photos", "--detector", f"{plug}:brightest", "--overlay", "photos/drawn").stdout
+        assert (
+            "in 3 images"
+            in kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "photos/drawn").stdout
+        )
     assert {path: path.read_bytes() for path in before} == before
 
 
 def test_two_photographs_of_one_stem_are_drawn_into_two_files(folder, plug):
     photos(folder, 1)
     cv2.imwrite(str(folder / "photos" / "0.jpg"), np.zeros((60, 80, 3), np.uint8))
-    assert run("photos", "--detector", f"{plug}:brightest", "--overlay", "drawn").exit_code == 0
+    kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "drawn")
     assert sorted(path.name for path in (folder / "drawn").iterdir()) == ["0.jpg.png", "0.png"]
 
 
@@ -269,8 +255,7 @@ def test_what_cannot_be_written_is_told_before_the_first_image(folder, option, v
     name = f"counting_{abs(hash((str(folder), value)))}"
     code = "def f(image):\n    open('called', 'w')\n    return Detections.none()\n"
     (folder / f"{name}.py").write_text(f"from kpbench import Detections\n{code}")
-    result = run("set", "--detector", f"{name}:f", "--workers", 1, option, value)
-    assert result.exit_code == 1
+    result = kpbench("detect", "set", "--detector", f"{name}:f", "--workers", 1, option, value, code=1)
     assert result.stderr.startswith(f"kpbench: {says}")
     assert not (folder / "called").exists()
 
@@ -304,8 +289,7 @@ def test_an_interrupt_says_how_to_go_on(folder):
     photos(folder)
     name = f"stopped_{abs(hash(str(folder)))}"
     (folder / f"{name}.py").write_text("def f(image):\n    raise KeyboardInterrupt\n")
-    result = run("photos", "--detector", f"{name}:f")
-    assert result.exit_code == 130
+    result = kpbench("detect", "photos", "--detector", f"{name}:f", code=130)
     assert result.stderr == "kpbench: interrupted: preds.json is not written; the same command starts anew\n"
 
 
@@ -344,7 +328,7 @@ def test_a_video_that_lacks_frames_is_told(folder, monkeypatch):
 def test_a_name_that_is_no_utf8_is_drawn_and_made_into_a_set(folder, plug):
     photos(folder, 1)
     os.rename(folder / "photos" / "0.png", os.fsencode(folder / "photos") + b"/\xff.png")
-    assert run("photos", "--detector", f"{plug}:brightest", "--overlay", "drawn").exit_code == 0
+    kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "drawn")
     assert os.listdir(os.fsencode(folder / "drawn")) == [b"\xff.png"]
     made = generate(SynthConfig(2, size_px=(96, 96), backgrounds=folder / "photos"), "set", workers=1)
     assert len(list(made.dataset.verify())) == 1
@@ -358,7 +342,6 @@ def test_an_image_of_a_few_px_holds_no_features(name):
 def test_images_of_several_sizes_make_no_video(folder, plug):
     photos(folder, 2)
     cv2.imwrite(str(folder / "photos" / "z.png"), np.zeros((30, 40, 3), np.uint8))
-    result = run("photos", "--detector", f"{plug}:brightest", "--overlay", "out.mp4")
-    assert result.exit_code == 1
+    result = kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", code=1)
     assert result.stderr.startswith("kpbench: out.mp4: z.png is of another size than those before, expected a folder")
     assert not (folder / "out.mp4").exists()

@@ -6,25 +6,17 @@ from pathlib import Path
 
 import pikepdf
 import pytest
-from click.testing import CliRunner
+from helpers import kpbench
 
-from kpbench.cli import main
 from kpbench.patches.design import shipped_patches
 
 
-def run(*arguments):
-    return CliRunner().invoke(main, ["render-patches", *map(str, arguments)])
-
-
 def done(*arguments):
-    result = run(*arguments)
-    assert result.exit_code == 0, result.output
+    result = kpbench("render-patches", *arguments)
     return [Path(line) for line in result.stdout.splitlines()]
 
 
-@pytest.fixture(autouse=True)
-def empty_folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def load(path):
@@ -116,8 +108,7 @@ def test_measured_corrects_what_was_printed_and_renders_nothing():
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_1(arguments, message):
-    result = run(*arguments)
-    assert result.exit_code == 1
+    result = kpbench("render-patches", *arguments, code=1)
     assert result.stdout == ""
     assert re.search(message, result.stderr), result.stderr
     assert result.stderr.startswith("kpbench: ")
@@ -137,16 +128,14 @@ def test_bad_input_is_one_line_and_exit_code_1(arguments, message):
     ],
 )
 def test_wrong_usage_is_exit_code_2(arguments, message):
-    result = run(*arguments)
-    assert result.exit_code == 2
+    result = kpbench("render-patches", *arguments, code=2)
     assert message in result.stderr
 
 
 def test_two_designs_of_one_name_do_not_overwrite_each_other():
     for n in (1, 2):
         Path(f"{n}.toml").write_text(f'name = "same"\nid = {n}\nsemicircles = [{{ start_deg = 0, ink = "black" }}]')
-    result = run("--board", "hexagon", "--design", "1.toml", "--design", "2.toml")
-    assert result.exit_code == 1
+    result = kpbench("render-patches", "--board", "hexagon", "--design", "1.toml", "--design", "2.toml", code=1)
     assert "two boards would be written to hexagon-same" in result.stderr
     assert not Path("patches-print").exists()
 

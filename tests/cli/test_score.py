@@ -5,10 +5,8 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from click.testing import CliRunner
-from helpers import write_dataset
+from helpers import kpbench, write_dataset
 
-from kpbench.cli import main
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.folder import open_dataset
 from kpbench.files import sha256_of
@@ -25,22 +23,9 @@ def perfect(images=IMAGES, **about):
     )
 
 
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def kpbench(*args, code=0):
-    result = CliRunner().invoke(main, ["score", *map(str, args)])
-    assert result.exit_code == code, result.output
-    assert code == 0 or "Traceback" not in result.output
-    return result
-
-
 def complaint(*args):
     """The one line of an error."""
-    lines = kpbench(*args, code=1).stderr.splitlines()
+    lines = kpbench("score", *args, code=1).stderr.splitlines()
     assert len(lines) == 1
     return lines[0]
 
@@ -48,7 +33,7 @@ def complaint(*args):
 def test_the_plain_call_finds_kpbench_data(here):
     write_dataset(here / "kpbench-data", IMAGES)
     write_predictions("preds.json", perfect(detector={"name": "oracle", "version": "2"}))
-    result = kpbench("preds.json")
+    result = kpbench("score", "preds.json")
     assert result.stderr == ""
     lines = result.stdout.splitlines()
     assert lines[0] == "predictions  preds.json, oracle 2"
@@ -63,7 +48,7 @@ def test_undefined_is_na_and_the_printed_reading_is_shown_where_it_differs(here)
     twice = Detections([[10, 10], [10.5, 10]], [1, 0.5], [0, 0])
     none = Detections.none()
     write_predictions("p.json", Predictions.from_detections([twice, none, none, none]))
-    lines = kpbench("p.json").stdout.splitlines()
+    lines = kpbench("score", "p.json").stdout.splitlines()
     rows = {tuple(line.split()[:3]): line.split() for line in lines if line.startswith(("blur ", "all "))}
     assert next(line for line in lines if line.startswith("detection score")).startswith(
         "detection score                0.25"
@@ -75,7 +60,7 @@ def test_undefined_is_na_and_the_printed_reading_is_shown_where_it_differs(here)
         ("blur", "0", "all"), ("blur", "1", "all"), ("blur", "0", "0"), ("blur", "0", "1"), ("blur", "1", "0"),
         ("blur", "1", "1"), ("all", "all", "0"), ("all", "all", "1"), ("all", "all", "all"),
     ]  # fmt: skip
-    literal = kpbench("p.json", "--matching", "literal").stdout
+    literal = kpbench("score", "p.json", "--matching", "literal").stdout
     assert "detection score                0.5000" in literal
 
 
@@ -83,7 +68,7 @@ def test_files_hold_what_the_screen_shows(here):
     data = write_dataset(here / "kpbench-data", IMAGES, condition="blur")
     write_predictions("p.json", perfect(detector={"name": "oracle"}))
     args = ["p.json", "--json", "s.json", "--csv", "s.csv", "--eps", "0.2", "--eps-radius", "minor"]
-    kpbench(*args)
+    kpbench("score", *args)
     content = json.loads((here / "s.json").read_text())
     assert content["schema"] == "kpbench.scores/1"
     assert content["dataset"] == {"fingerprint": data.fingerprint, "images": 4}
@@ -109,7 +94,7 @@ def test_files_hold_what_the_screen_shows(here):
     schema = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "scores-1.json").read_text())
     jsonschema.Draft202012Validator(schema).validate(content)
     before = (here / "s.json").read_bytes()
-    kpbench(*args)
+    kpbench("score", *args)
     assert (here / "s.json").read_bytes() == before
 
 
@@ -120,7 +105,9 @@ def test_where_the_dataset_is_found(here):
     write_dataset(here / "sub" / "beside", [[]])
 
     def images(*args):
-        return next(line.split()[1] for line in kpbench(*args).stdout.splitlines() if line.startswith("images"))
+        return next(
+            line.split()[1] for line in kpbench("score", *args).stdout.splitlines() if line.startswith("images")
+        )
 
     write_predictions("p.json", perfect())
     assert images("p.json", "--gt", "other") == "4"
@@ -129,7 +116,7 @@ def test_where_the_dataset_is_found(here):
     write_predictions("sub/p.json", perfect([[]], dataset="beside"))
     assert images("sub/p.json") == "1"
     write_predictions("p.json", perfect([[]] * 2, dataset="gone"))
-    result = kpbench("p.json")
+    result = kpbench("score", "p.json")
     assert (
         result.stderr == "kpbench: p.json names the dataset 'gone', which is not here; scoring against ./kpbench-data\n"
     )
@@ -159,7 +146,7 @@ def test_images_must_be_the_same(here):
         "kpbench: few.json does not fit kpbench-data: no prediction for image_id 3; 1 of 4 images are missing "
         "(--allow-missing takes them as images without detections)"
     )
-    assert "4: 3 matched" in kpbench("few.json", "--allow-missing").stdout
+    assert "4: 3 matched" in kpbench("score", "few.json", "--allow-missing").stdout
     write_predictions("many.json", perfect([*IMAGES, []]))
     assert complaint("many.json", "--allow-missing").startswith(
         "kpbench: many.json does not fit kpbench-data: image_id 4 is not in the dataset (4 images, image_id 0 to 3)"
@@ -180,9 +167,17 @@ def test_bad_predictions_are_one_line(here):
 def test_gates(here):
     write_dataset(here / "kpbench-data", IMAGES)
     write_predictions("p.json", perfect([*IMAGES[:3], [(0, 0, 1, 1)]]))
-    kpbench("p.json", "--min", "detection_score=0.75", "--max", "average_false_alarm=0.25")
+    kpbench("score", "p.json", "--min", "detection_score=0.75", "--max", "average_false_alarm=0.25")
     result = kpbench(
-        "p.json", "--min", "detection_score=0.8", "--max", "average_false_alarm=0.2", "--json", "s.json", code=1
+        "score",
+        "p.json",
+        "--min",
+        "detection_score=0.8",
+        "--max",
+        "average_false_alarm=0.2",
+        "--json",
+        "s.json",
+        code=1,
     )
     assert result.stderr == (
         "kpbench: detection_score is 0.75, expected at least 0.8; average_false_alarm is 0.25, expected at most 0.2\n"
@@ -204,7 +199,7 @@ def test_gates(here):
     ],
 )
 def test_wrong_usage_is_exit_2(here, args):
-    assert "Usage" in kpbench("p.json", *args, code=2).stderr
+    assert "Usage" in kpbench("score", "p.json", *args, code=2).stderr
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(here):
@@ -217,8 +212,8 @@ def test_coco_truth_scores_as_the_dataset_that_it_was_exported_from(here):
     data = write_dataset(here / "kpbench-data", IMAGES, condition="blur")
     export_dataset(data, "coco", here / "coco")
     write_predictions("p.json", perfect([*IMAGES[:3], [(30.5, 30, 20, 0)]]))
-    kpbench("p.json", "--json", "a.json")
-    out = kpbench("p.json", "--gt", "coco/annotations.json", "--json", "b.json", "--report", "r.html").stdout
+    kpbench("score", "p.json", "--json", "a.json")
+    out = kpbench("score", "p.json", "--gt", "coco/annotations.json", "--json", "b.json", "--report", "r.html").stdout
     assert "dataset      coco/annotations.json" in out
     a, b = (json.loads((here / name).read_text()) for name in ("a.json", "b.json"))
     assert a["metrics"] == b["metrics"]
@@ -226,7 +221,10 @@ def test_coco_truth_scores_as_the_dataset_that_it_was_exported_from(here):
     assert "data:image/jpeg" in (here / "r.html").read_text()
     for image in (here / "coco" / "images").iterdir():
         image.unlink()
-    assert "r.html shows no images" in kpbench("p.json", "--gt", "coco/annotations.json", "--report", "r.html").stderr
+    assert (
+        "r.html shows no images"
+        in kpbench("score", "p.json", "--gt", "coco/annotations.json", "--report", "r.html").stderr
+    )
     assert json.loads((here / "b.json").read_text())["dataset"]["fingerprint"] == data.fingerprint
 
 
@@ -234,13 +232,13 @@ def test_the_coco_export_is_known_by_its_datasets_fingerprint(here):
     data = write_dataset(here / "kpbench-data", IMAGES)
     export_dataset(data, "coco", here / "coco")
     write_predictions("p.json", replace(perfect(), fingerprint=data.fingerprint))
-    kpbench("p.json", "--gt", "coco/annotations.json")
+    kpbench("score", "p.json", "--gt", "coco/annotations.json")
     write_predictions("p.json", replace(perfect(), fingerprint="a" * 64))
     assert "made for the dataset with fingerprint aaaaaaaaaaaa" in complaint("p.json", "--gt", "coco/annotations.json")
     content = json.loads((here / "coco/annotations.json").read_text())
     (here / "other.json").write_text(json.dumps(content | {"info": {"description": "of another tool"}}))
     write_predictions("p.json", replace(perfect(), fingerprint=sha256_of(here / "other.json")))
-    kpbench("p.json", "--gt", "other.json")
+    kpbench("score", "p.json", "--gt", "other.json")
 
 
 def test_coco_truth_with_one_radius_and_results(here):
@@ -259,7 +257,7 @@ def test_coco_truth_with_one_radius_and_results(here):
     ]
     (here / "results.json").write_text(json.dumps(results))
     assert "no prediction for image_id 2" in complaint("results.json", "--gt", "gt.json")
-    kpbench("results.json", "--gt", "gt.json", "--allow-missing", "--json", "s.json")
+    kpbench("score", "results.json", "--gt", "gt.json", "--allow-missing", "--json", "s.json")
     metrics = json.loads((here / "s.json").read_text())["metrics"]
     assert metrics["counts"]["truths"] == 2
     assert (metrics["detection_score"], metrics["id_matching_score"], metrics["average_false_alarm"]) == (0.5, 1, 0.5)
@@ -306,8 +304,7 @@ def test_what_is_read_is_not_written(here):
         ["score", "preds.json", "--json", "a.html", "--report", "a.html"],
         ["compare", "preds.json", "preds.json", "--json", "preds.json"],
     ):
-        refused = CliRunner().invoke(main, arguments)
-        assert refused.exit_code == 1
+        refused = kpbench(*arguments, code=1)
         assert "this command reads it, or writes it twice" in refused.stderr
     assert Path("preds.json").read_bytes() == before
     assert not Path("a.html").exists()

@@ -11,13 +11,11 @@ import cv2
 import h5py
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from helpers import digests, kpbench
 
-from kpbench.cli import main
 from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate, generate_part, merge
 from kpbench.errors import DataError
-from kpbench.files import sha256_of
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, rasterise
 from kpbench.synth.finish import share_open
@@ -38,10 +36,6 @@ def photos(tmp_path_factory):
 
 def config(photos, **changes):
     return SynthConfig(**{"n": 10, "size_px": (160, 120), "backgrounds": photos, "shard_size": 4, **changes})
-
-
-def digests(folder):
-    return {path.name: sha256_of(path) for path in sorted(folder.iterdir())}
 
 
 def test_neither_workers_nor_an_interruption_change_a_byte(photos, tmp_path):
@@ -292,7 +286,7 @@ def test_a_url_takes_a_dataset_as_a_folder_does(photos, tmp_path):
     assert (there.image(7) == local.image(7)).all()
     assert len(list(there.verify())) == 3
     for command in ("inspect", "preview", "verify"):
-        assert CliRunner().invoke(main, [command, url]).exit_code == 0
+        kpbench(command, url)
     with pytest.raises(DataError, match="already holds a dataset"):
         generate(config(photos), url, workers=1)
     with pytest.raises(DataError, match=r"nosuch:.* cannot be reached"):
@@ -315,9 +309,8 @@ def test_work_in_this_process_leaves_its_threads_as_they_were(tmp_path):
 )
 def test_bad_radii_are_refused_in_a_line(tmp_path, radii, code, said):
     out = tmp_path / "set"
-    result = CliRunner().invoke(main, ["synth", "--n", "1", "--radius-px", radii, "--out", str(out)])
-    assert result.exit_code == code
-    assert said in result.output
+    refused = kpbench("synth", "--n", 1, "--radius-px", radii, "--out", out, code=code)
+    assert said in refused.stderr
     assert not out.exists()
 
 

@@ -1,14 +1,10 @@
-import csv
 import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from helpers import write_dataset
 
-from kpbench.cli import main
 from kpbench.errors import DataError, GateFailed
-from kpbench.predictions.files import Predictions, write_predictions
+from kpbench.predictions.files import Predictions
 from kpbench.report.report import Report, to_html, to_markdown_report
 from kpbench.scoring.comparison import METRICS, check_regression, compare
 from kpbench.scoring.scores import score
@@ -122,58 +118,6 @@ def test_a_report_shows_the_comparison():
     report = Report((a, b), comparisons=(compare(a, b),))
     assert "**a minus b**" in to_markdown_report(report)
     assert "a against the others" in to_html(report)
-
-
-# --- the command ------------------------------------------------------------------------------------------------
-
-
-def kpbench(*args, code=0):
-    result = CliRunner().invoke(main, ["compare", *map(str, args)])
-    assert result.exit_code == code, result.output
-    return result
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_dataset(tmp_path / "kpbench-data", [[(10, 10, 10, 0), (50, 10, 10, 1)]] * 12)
-    good = Detections([[10, 10], [50, 10]], [1, 1], [0, 1])
-    write_predictions("good.json", Predictions.from_detections([good] * 12, detector={"name": "d"}))
-    poor = [good if k % 3 else Detections.none() for k in range(12)]
-    write_predictions("poor.csv", Predictions.from_detections(poor, detector={"name": "d"}))
-    return tmp_path
-
-
-def test_the_command_tells_who_is_better_and_exits(here):
-    result = kpbench("good.json", "poor.csv", "--fail-on-regression", "--json", "c.json", "--report", "c.html")
-    line = next(line for line in result.stdout.splitlines() if "detection score" in line)
-    assert line.split()[:2] == ["d", "poor.csv"]
-    assert "better" in line
-    content = json.loads((here / "c.json").read_text())
-    assert content["schema"] == "kpbench.comparison/1"
-    assert content["comparisons"][0]["differences"][0]["difference"] == pytest.approx(1 / 3)
-    assert [p["file"] for p in content["provenance"]["predictions"]] == ["good.json", "poor.csv"]
-    assert "d good.json against the others" in (here / "c.html").read_text()
-    worse = kpbench("poor.csv", "good.json", "--fail-on-regression", code=1)
-    assert worse.stderr.startswith(
-        "kpbench: detection score of d poor.csv is worse than that of d good.json by -0.3333 ["
-    )
-    assert "Traceback" not in worse.output
-    assert kpbench("poor.csv", "good.json").stderr == ""
-
-
-def test_wrong_usage(here):
-    assert "expected two or more predictions files" in kpbench("good.json", code=2).stderr
-    assert (
-        "expected a file ending in .html, .md, .tex" in kpbench("a.json", "b.json", "--report", "x.pdf", code=2).stderr
-    )
-    assert "poor.csv does not fit kpbench-data" in _of_other_images(here)
-
-
-def _of_other_images(here):
-    rows = list(csv.reader((here / "poor.csv").read_text().splitlines()))
-    (here / "poor.csv").write_text("\n".join(",".join(row) for row in rows[1:-2]))
-    return kpbench("good.json", "poor.csv", code=1).stderr
 
 
 def test_one_scene_cannot_tell_and_does_not_pass():

@@ -1,20 +1,16 @@
 import hashlib
 import json
 import pickle
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from helpers import digests
 
 import kpbench.synth.suite
-from kpbench.cli import main
 from kpbench.dataset.generation import generate
 from kpbench.degrade.effects import blur
-from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
-from kpbench.files import sha256_of
 from kpbench.render.background import procedural
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite, shipped_suites
@@ -140,10 +136,6 @@ def test_every_extended_condition_changes_the_image():
         assert sample.image.shape == base.shape
 
 
-def digests(folder):
-    return {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
-
-
 def test_interrupted_and_resumed_is_the_same(tmp_path):
     made = config(only=("blur",), shard_size=10)
     generate(made, tmp_path / "one", workers=1)
@@ -228,89 +220,6 @@ def test_a_wrong_suite_is_one_line(tmp_path, old, new, says):
 def test_a_value_out_of_range_is_one_line(changes, says):
     with pytest.raises(DataError, match=says):
         config(**changes)
-
-
-def run(*arguments):
-    return CliRunner().invoke(main, [str(a) for a in arguments])
-
-
-def test_the_suite_command(tmp_path):
-    made = ("suite", "paper-v1", "--images", 1, "--size", "203x155", "--workers", 1, "--only", "scale,blur")
-    first = run(*made, "--out", tmp_path / "a")
-    assert first.exit_code == 0, first.output
-    assert "44 images, 1 shards, fingerprint" in first.stdout
-    assert run(*made, "--out", tmp_path / "b", "--distortion", "0,0").exit_code == 0
-    assert digests(tmp_path / "a") == digests(tmp_path / "b")
-    again = run(*made, "--out", tmp_path / "a", "--seed", 1)
-    assert again.exit_code == 1
-    assert "already holds a dataset" in again.stderr
-    unknown = run("suite", "paper-v9")
-    assert unknown.exit_code == 1
-    assert unknown.stderr == (
-        "kpbench: there is no suite 'paper-v9', only: extended-v1, paper-v1, or a .toml file of your own\n"
-    )
-    assert run("suite", "paper-v1", "--distortion", "much").exit_code == 2
-
-
-def test_the_degrade_command(tmp_path):
-    source = tmp_path / "in"
-    (source / "deep").mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    grey = rng.integers(0, 255, (40, 50), dtype=np.uint8)
-    colour = rng.integers(0, 255, (40, 50, 3), dtype=np.uint8)
-    cv2.imwrite(str(source / "grey.png"), grey)
-    cv2.imwrite(str(source / "deep" / "colour.png"), colour)
-    (source / "broken.jpg").write_bytes(b"no image")
-    done = run("degrade", source, "--effect", "blur", "--level", 7, "--out", tmp_path / "out")
-    assert done.exit_code == 1
-    assert done.stderr == "kpbench: 1 images cannot be decoded, the others are done: broken.jpg\n"
-    assert len(done.stdout.splitlines()) == 2
-    got = cv2.imread(str(tmp_path / "out" / "grey.png"), cv2.IMREAD_UNCHANGED)
-    assert (got == blur(grey, 7)).all()
-    got = cv2.imread(str(tmp_path / "out" / "deep" / "colour.png"), cv2.IMREAD_UNCHANGED)
-    assert (got == blur(colour, 7)).all()
-    stack = ("--effect", "noise", "--level", 20, "--effect", "jpeg", "--level", 40)
-    one = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "one")
-    two = run("degrade", source / "grey.png", *stack, "--out", tmp_path / "two")
-    assert '[{"effect": "noise", "sigma": 20.0}, {"effect": "jpeg", "quality": 40.0}]' in one.stdout
-    assert two.exit_code == 0
-    assert digests(tmp_path / "one") == digests(tmp_path / "two")
-    before = digests(source)
-    for path in (source, source / "grey.png"):
-        assert "would be overwritten" in run("degrade", path, "--effect", "blur", "--level", 7, "--out", source).stderr
-    assert digests(source) == before
-    (source / "dataset.json").write_text("{}")
-    assert "a dataset, expected images" in run("degrade", source, "--effect", "blur", "--level", 7).stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["nowhere.png", "--effect", "blur", "--level", "7"], "nowhere.png: no such dataset, image, folder or video"),
-        ([__file__, "--effect", "blur", "--level", "7"], "cannot be decoded as an image"),
-        (
-            [Path(__file__).parents[2] / "patches", "--effect", "blur", "--level", "7"],
-            "neither a dataset nor a folder with images",
-        ),
-    ],
-)
-def test_what_cannot_be_degraded_is_one_line(arguments, says, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    told = run("degrade", *arguments)
-    assert told.exit_code == 1
-    assert says in told.stderr
-    assert told.stderr.count("\n") == 1
-
-
-def test_every_effect_needs_its_level():
-    assert run("degrade", "a.png", "--effect", "blur").exit_code == 2
-    assert run("degrade", "a.png", "--effect", "blur", "--level", 3, "--level", 5).exit_code == 2
-
-
-def test_the_help_names_every_effect():
-    told = " ".join(run("degrade", "--help").stdout.split())
-    for effect in set(LADDER) - {"dimming-literal"}:
-        assert effect in told
 
 
 def test_a_background_is_made_once_though_every_rung_shows_it(tmp_path, monkeypatch):

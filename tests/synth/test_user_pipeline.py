@@ -2,9 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
+from helpers import kpbench
 
-from kpbench.cli import main
 from kpbench.dataset.folder import open_dataset
 from kpbench.errors import AugmentationError
 from kpbench.fitting import design_fit as refine
@@ -83,18 +82,16 @@ def test_what_cannot_be_carried_is_refused(name, options, said, tmp_path):
 def test_a_file_without_a_pipeline_is_refused(text, tmp_path):
     path = tmp_path / "wrong.json"
     path.write_text(text)
-    done = CliRunner().invoke(main, ["synth", "--n", "2", "--augment", str(path), "--out", str(tmp_path / "set")])
-    assert done.exit_code == 1
-    assert f"{path}: no pipeline" in str(done.exception or done.output) + done.output
+    refused = kpbench("synth", "--n", 2, "--augment", path, "--out", tmp_path / "set", code=1)
+    assert f"{path}: no pipeline" in refused.stderr
     assert not (tmp_path / "set").exists()
 
 
 def test_augmented_sets_are_the_same_whatever_the_workers(tmp_path):
     path = saved(tmp_path, ("SafeRotate", {}), ("GaussNoise", {}), suffix="yaml")
-    command = ["synth", "--n", "6", "--size", "160x120", "--shard-size", "3", "--augment", str(path)]
+    command = ["synth", "--n", 6, "--size", "160x120", "--shard-size", 3, "--augment", path]
     for workers in ("1", "2"):
-        out = str(tmp_path / workers)
-        assert CliRunner().invoke(main, [*command, "--workers", workers, "--out", out]).exit_code == 0
+        kpbench(*command, "--workers", workers, "--out", tmp_path / workers)
     one, two = (open_dataset(tmp_path / workers) for workers in ("1", "2"))
     assert one.fingerprint == two.fingerprint
     assert one.config["augmentation"]["transform"]["transforms"][0]["__class_fullname__"] == "SafeRotate"

@@ -1,0 +1,51 @@
+import csv
+import json
+
+import pytest
+from helpers import kpbench, write_dataset
+
+from kpbench.predictions.files import Predictions, write_predictions
+from kpbench.types import Detections
+
+
+@pytest.fixture
+def here(here):
+    write_dataset(here / "kpbench-data", [[(10, 10, 10, 0), (50, 10, 10, 1)]] * 12)
+    good = Detections([[10, 10], [50, 10]], [1, 1], [0, 1])
+    write_predictions("good.json", Predictions.from_detections([good] * 12, detector={"name": "d"}))
+    poor = [good if k % 3 else Detections.none() for k in range(12)]
+    write_predictions("poor.csv", Predictions.from_detections(poor, detector={"name": "d"}))
+    return here
+
+
+def test_the_command_tells_who_is_better_and_exits(here):
+    result = kpbench(
+        "compare", "good.json", "poor.csv", "--fail-on-regression", "--json", "c.json", "--report", "c.html"
+    )
+    line = next(line for line in result.stdout.splitlines() if "detection score" in line)
+    assert line.split()[:2] == ["d", "poor.csv"]
+    assert "better" in line
+    content = json.loads((here / "c.json").read_text())
+    assert content["schema"] == "kpbench.comparison/1"
+    assert content["comparisons"][0]["differences"][0]["difference"] == pytest.approx(1 / 3)
+    assert [p["file"] for p in content["provenance"]["predictions"]] == ["good.json", "poor.csv"]
+    assert "d good.json against the others" in (here / "c.html").read_text()
+    worse = kpbench("compare", "poor.csv", "good.json", "--fail-on-regression", code=1)
+    assert worse.stderr.startswith(
+        "kpbench: detection score of d poor.csv is worse than that of d good.json by -0.3333 ["
+    )
+    assert "Traceback" not in worse.output
+    assert kpbench("compare", "poor.csv", "good.json").stderr == ""
+
+
+def test_wrong_usage(here):
+    assert "expected two or more predictions files" in kpbench("compare", "good.json", code=2).stderr
+    refused = kpbench("compare", "a.json", "b.json", "--report", "x.pdf", code=2)
+    assert "expected a file ending in .html, .md, .tex" in refused.stderr
+
+
+def test_predictions_of_other_images_do_not_fit(here):
+    rows = list(csv.reader((here / "poor.csv").read_text().splitlines()))
+    (here / "poor.csv").write_text("\n".join(",".join(row) for row in rows[1:-2]))
+    refused = kpbench("compare", "good.json", "poor.csv", code=1)
+    assert "poor.csv does not fit kpbench-data" in refused.stderr
