@@ -28,11 +28,11 @@ from torch import nn
 from tqdm import tqdm
 
 import kpbench
-from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.fitting.pyramid import Picture
 from kpbench.fitting.templates import VIEW_PX
 from kpbench.fitting.views import OCTAVES, surroundings
+from kpbench.images import to_grey
 from kpbench.workers import count_cores, use_one_thread
 
 NEAR, FAR = 0.6, 1.0

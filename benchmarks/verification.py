@@ -33,12 +33,12 @@ from tqdm import tqdm
 
 import kpbench
 from kpbench.detectors import verification as verify
-from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector
 from kpbench.detectors.suppression import suppress
 from kpbench.fitting.align import short_axis
 from kpbench.fitting.pyramid import Picture
 from kpbench.fitting.templates import VIEW_PX, bank
+from kpbench.images import to_grey
 from kpbench.workers import count_cores, use_one_thread
 
 MORE = 1.0

@@ -27,7 +27,7 @@ from kpbench.dataset.shard import canonical_json
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import detect_some
 from kpbench.errors import DataError
-from kpbench.files import check_own, write_atomic
+from kpbench.files import make_folder, require_own_folder, write_atomic
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.report.figures import breakpoint_table, overview_table, paper_table
@@ -133,7 +133,7 @@ def bench(
     DataError
         If a detector cannot be loaded, two have one name, a dataset cannot be made, or the folder holds other files.
     """
-    check_own(Path(out), "suites", "a bench")
+    require_own_folder(Path(out), "suites", "a bench")
     loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
     labels = [detector.name for detector in loaded.values()]
     if len(set(labels)) < len(labels):
@@ -186,11 +186,7 @@ def _forget(file: Path) -> None:
 
 def _parts(dataset: Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:
     """The parts of a predictions file, in a folder beside it until all are there."""
-    folder = file.with_suffix(".parts")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+    folder = make_folder(file.with_suffix(".parts"))
     return [
         _Part(dataset.path, detector, about, first, min(PART, len(dataset) - first), folder / f"{first:08d}.json")
         for first in range(0, len(dataset), PART)

@@ -5,7 +5,6 @@
     KpbenchError            one line for the user: file, place, what was expected
     ├── DesignError         a patch, board or page that cannot be (TOML, geometry, paper size)
     ├── DataError           a dataset, shard, image folder or weights file that cannot be used
-    ├── AugmentationError   a pipeline of the user that cannot be applied to a scene
     ├── PredictionsError    a predictions file that cannot be read, or that fits no dataset
     └── GateFailed          the scores are fine to read, but a ``--min`` gate was not met
 
@@ -25,10 +24,6 @@ class DesignError(KpbenchError):
 
 class DataError(KpbenchError):
     """A dataset, shard, image folder or weights file that cannot be used."""
-
-
-class AugmentationError(KpbenchError):
-    """A pipeline of the user that cannot be applied to a scene."""
 
 
 class PredictionsError(KpbenchError):

@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypedDict, Unpack
 
 from kpbench.dataset.folder import MANIFEST, open_dataset
 from kpbench.errors import DataError, PredictionsError
-from kpbench.files import check_targets, write_atomic
+from kpbench.files import refuse_overwrite, write_atomic
 from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import read_predictions
 from kpbench.report.figures import pose_table
@@ -160,7 +160,7 @@ def score_file(
         If the dataset cannot be read, `pose` is set and the dataset shows no board, or a file cannot be written.
     """
     path, (to_json, to_csv, to_report) = Path(predictions), map(_as_path, (json_file, csv_file, report_file))
-    _check_targets([path], [to_json, to_csv], to_report)
+    _refuse_overwrite([path], [to_json, to_csv], to_report)
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _pose_groups(scores, dataset) if pose else ()
     known = provenance(dataset.path, dataset.fingerprint, [path], command)
@@ -208,7 +208,7 @@ def compare_files(
     if len(predictions) < 2:
         raise ValueError(f"{len(predictions)} predictions files, expected two or more")
     paths, to_json, to_report = [Path(file) for file in predictions], _as_path(json_file), _as_path(report_file)
-    _check_targets(paths, [to_json], to_report)
+    _refuse_overwrite(paths, [to_json], to_report)
     dataset, scores = _score_files(paths, truth, warn, options)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
     known = provenance(dataset.path, dataset.fingerprint, paths, command)
@@ -223,11 +223,11 @@ def _as_path(file: str | Path | None) -> Path | None:
     return None if file is None else Path(file)
 
 
-def _check_targets(sources: Sequence[Path], targets: Sequence[Path | None], report: Path | None) -> None:
+def _refuse_overwrite(sources: Sequence[Path], targets: Sequence[Path | None], report: Path | None) -> None:
     """Refuse files that cannot be written, before any work is done."""
     if report:
         require_report_suffix(report)
-    check_targets([*targets, report], sources)
+    refuse_overwrite([*targets, report], sources)
 
 
 def _score_files(

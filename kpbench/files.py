@@ -103,7 +103,7 @@ def is_local(path: object) -> bool:
     return isinstance(path, (str, Path))
 
 
-def check_targets(targets: Iterable[Path | None], sources: Iterable[Path] = ()) -> None:
+def refuse_overwrite(targets: Iterable[Path | None], sources: Iterable[Path] = ()) -> None:
     """Refuse to write a file that the same command reads, or writes twice.
 
     Raises
@@ -120,7 +120,7 @@ def check_targets(targets: Iterable[Path | None], sources: Iterable[Path] = ()) 
         taken.add(target.resolve())
 
 
-def check_own(folder: Path, mark: str, what: str) -> None:
+def require_own_folder(folder: Path, mark: str, what: str) -> None:
     """Refuse to write among other files: a folder must be new, empty, or hold ``mark`` from an earlier run.
 
     Raises
@@ -133,6 +133,21 @@ def check_own(folder: Path, mark: str, what: str) -> None:
     others = sorted(path.name for path in folder.glob("*") if not path.name.startswith("."))
     if others and not (folder / mark).exists():
         raise DataError(f"{folder}: holds other files ({others[0]}, ...), expected a new or an empty folder for {what}")
+
+
+def make_folder(folder: Path) -> Path:
+    """Make a folder and those above it unless they exist, and return it.
+
+    Raises
+    ------
+    DataError
+        If the folder cannot be made. The message names it.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+    return folder
 
 
 def write_atomic(path: Path, data: bytes | memoryview) -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
-from kpbench.files import IMAGE_SUFFIXES, image_files, write_atomic
+from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, write_atomic
 from kpbench.types import UInt8
 
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
@@ -60,7 +60,7 @@ def open_images(source: str, but: Path | None = None) -> Source:
     return Source(iter([(path.name, image)]), 1)
 
 
-def check_apart(source: str | Path, target: Path) -> None:
+def refuse_same_folder(source: str | Path, target: Path) -> None:
     """Refuse to write images over those that are read.
 
     Raises
@@ -114,21 +114,17 @@ def image_writer(
     if target is None:
         yield lambda name, image: None
         return
-    try:
-        file = target.suffix.lower() in (*VIDEOS, *PICTURES) and not target.is_dir()
-        if file and target.suffix.lower() in PICTURES and count != 1:
-            raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
-        (target.parent if file else target).mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{target}: cannot be written, {error.strerror}") from None
+    file = target.suffix.lower() in (*VIDEOS, *PICTURES) and not target.is_dir()
+    if file and target.suffix.lower() in PICTURES and count != 1:
+        raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
+    make_folder(target.parent if file else target)
     if not file or target.suffix.lower() in PICTURES:
 
         def write_file(name: str, image: UInt8) -> None:
             path = target if file else target / (name if name.endswith(".png") else f"{name}.png")
-            path.parent.mkdir(parents=True, exist_ok=True)
-            # OpenCV itself writes halves of files, and ends the process on names that are no UTF-8
-            suffix = path.suffix.lower()
-            write_atomic(path, cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
+            make_folder(path.parent)
+            # OpenCV's own writer leaves half of a file on a full disk, and ends the process on names that are not UTF-8
+            write_atomic(path, _encode(image, path.suffix.lower(), []))
 
         yield write_file
         return
@@ -177,3 +173,44 @@ def resize(grey: UInt8, width: int, height: int) -> UInt8:
         return grey
     how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
     return np.asarray(cv2.resize(grey, (width, height), interpolation=how), np.uint8)
+
+
+def to_grey(image: UInt8) -> UInt8:
+    """(H, W) or RGB (H, W, 3) to (H, W).
+
+    Raises
+    ------
+    DataError
+        If the array is no such image.
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def decode_photo(path: Path, channels: int) -> UInt8 | None:
+    """Decode a photograph as grey (channels 1) or RGB (3), whatever its EXIF says; None if it cannot be decoded."""
+    flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        data = np.fromfile(path, np.uint8)
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except (OSError, cv2.error):
+        return None
+    if image is None or min(image.shape[:2]) < 8:
+        return None
+    return np.asarray(image if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def encode_png(image: UInt8) -> bytes:
+    """Return a grey image (H, W) or an RGB image (H, W, 3) as the content of a PNG file."""
+    return _encode(image, ".png", [])
+
+
+def encode_jpeg(image: UInt8, quality: int) -> bytes:
+    """Return a grey image (H, W) or an RGB image (H, W, 3) as the content of a JPEG file; quality is from 1 to 100."""
+    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+
+
+def _encode(image: UInt8, suffix: str, settings: list[int]) -> bytes:
+    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
+    return cv2.imencode(suffix, pixels, settings)[1].tobytes()

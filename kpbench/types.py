@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,7 +117,7 @@ class Truth:
         return len(self.image_id)
 
 
-class Misfit(PredictionsError):
+class InvalidValue(PredictionsError):
     """A value that cannot be: in which image (position), at which keypoint of it (or None), and why."""
 
     def __init__(self, image: int, keypoint: int | None, image_id: int, problem: str) -> None:
@@ -221,29 +221,26 @@ def _check(p: Predictions) -> None:
     n, k = len(p.image_id), len(p.xy)
     if len(p.offsets) != n + 1 or p.offsets[0] != 0 or p.offsets[-1] != k or np.any(np.diff(p.offsets) < 0):
         raise PredictionsError(f"offsets do not run from 0 to {k} keypoints in {n} images")
-    if len(p.score) != k or (p.patch_id is not None and len(p.patch_id) != k):
-        ids = k if p.patch_id is None else len(p.patch_id)
-        raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {ids} ids do not belong together")
-
-    def complain(row: int, name: str, value: object, expected: str) -> NoReturn:
-        image = int(np.searchsorted(p.offsets, row, side="right")) - 1
-        keypoint = row - int(p.offsets[image])
-        raise Misfit(image, keypoint, int(p.image_id[image]), f"{name}[{keypoint}] is {value}, expected {expected}")
+    ids = np.zeros(k, np.int64) if p.patch_id is None else p.patch_id
+    if len(p.score) != k or len(ids) != k:
+        raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {len(ids)} ids do not belong together")
 
     if n and p.image_id.min() < 0:
         i = int(np.argmax(p.image_id < 0))
-        raise Misfit(i, None, int(p.image_id[i]), "image_id is negative, expected 0 or more")
+        raise InvalidValue(i, None, int(p.image_id[i]), "image_id is negative, expected 0 or more")
     order = np.argsort(p.image_id, kind="stable")
-    again = np.flatnonzero(np.diff(p.image_id[order]) == 0)
-    if len(again):
-        first, second = order[again[0]], order[again[0] + 1]
-        raise Misfit(int(second), None, int(p.image_id[second]), f"the image is there twice, first at {first}")
-    if not np.isfinite(p.xy).all():
-        row = int(np.argmin(np.isfinite(p.xy).all(axis=1)))
-        complain(row, "keypoints", p.xy[row].tolist(), "two finite numbers")
-    if not np.isfinite(p.score).all():
-        row = int(np.argmin(np.isfinite(p.score)))
-        complain(row, "scores", p.score[row].item(), "a finite number")
-    if p.patch_id is not None and k and p.patch_id.min() < 0:
-        row = int(np.argmax(p.patch_id < 0))
-        complain(row, "ids", p.patch_id[row].item(), "a patch id, 0 or more")
+    repeated = np.flatnonzero(np.diff(p.image_id[order]) == 0)
+    if len(repeated):
+        first, second = order[repeated[0]], order[repeated[0] + 1]
+        raise InvalidValue(int(second), None, int(p.image_id[second]), f"the image is there twice, first at {first}")
+    for name, column, valid, expected in (
+        ("keypoints", p.xy, np.isfinite(p.xy), "two finite numbers"),
+        ("scores", p.score, np.isfinite(p.score), "a finite number"),
+        ("ids", ids, ids >= 0, "a patch id, 0 or more"),
+    ):
+        if not valid.all():
+            row = int(np.argmin(valid.reshape(k, -1).all(axis=1)))
+            image = int(np.searchsorted(p.offsets, row, side="right")) - 1
+            keypoint = row - int(p.offsets[image])
+            problem = f"{name}[{keypoint}] is {column[row].tolist()}, expected {expected}"
+            raise InvalidValue(image, keypoint, int(p.image_id[image]), problem)

@@ -18,9 +18,8 @@ import numpy as np
 import torch
 
 import kpbench
-from kpbench.detectors.interface import to_grey
 from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
-from kpbench.images import resize
+from kpbench.images import resize, to_grey
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import NetworkConfig
 

@@ -35,8 +35,9 @@ import h5py
 import numpy as np
 
 from kpbench.dataset.generation import generate
+from kpbench.images import decode_photo
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.render.background import PhotoFolder, decode_photo
+from kpbench.render.background import PhotoFolder
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.types import UInt8
 

@@ -25,6 +25,7 @@ from itertools import pairwise
 import numpy as np
 
 from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.outline import arc_vertices
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
@@ -109,9 +110,10 @@ def _arc(radius: float, start_deg: float, end_deg: float, tolerance: float) -> F
     count = max(2, int(np.ceil(np.radians(end_deg - start_deg) / np.sqrt(16 * tolerance / radius))))
     angle = np.radians(np.linspace(start_deg, end_deg, count + 1))
     step = angle[1] - angle[0]
-    at = np.full(count + 1, radius * np.sqrt(step / np.sin(step)))  # equal area, as outline.flatten
-    at[[0, -1]] = radius
-    return np.column_stack([at * np.cos(angle), at * np.sin(angle)])
+    points = arc_vertices(radius, angle, step)
+    ends = angle[[0, -1]]
+    points[[0, -1]] = radius * np.column_stack([np.cos(ends), np.sin(ends)])
+    return points
 
 
 def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Float:

@@ -66,16 +66,15 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     Example:
       kpbench preview kpbench-data --count 20 --columns 5
     """
-    import cv2
-
     from kpbench.dataset.card import overview
     from kpbench.dataset.folder import open_dataset
     from kpbench.files import write_atomic
+    from kpbench.images import encode_png
 
     data = open_dataset(dataset)
     sheet = overview(data, count, columns, tile_width)
     target = out or data.path / "preview.png"
-    write_atomic(target, cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1].tobytes())
+    write_atomic(target, encode_png(sheet))
     click.echo(str(target))
 
 

@@ -39,14 +39,14 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     from kpbench.cli.progress import progress_bar
     from kpbench.degrade.own_images import degrade_files
     from kpbench.errors import DataError
-    from kpbench.images import check_apart, open_images
+    from kpbench.images import open_images, refuse_same_folder
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
     steps = tuple(zip(effects, levels, strict=True))
     if (source / "dataset.json").exists():
         raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
-    check_apart(source, out)
+    refuse_same_folder(source, out)
     images = open_images(str(source), but=out)
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):

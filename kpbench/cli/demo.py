@@ -21,9 +21,9 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
       kpbench demo
     """
     from kpbench.cli import main
-    from kpbench.files import check_own
+    from kpbench.files import require_own_folder
 
-    check_own(out, "print", "the demo")
+    require_own_folder(out, "print", "the demo")
     data, preds = out / "data", out / "preds.json"
     photographs = ["--backgrounds", str(backgrounds)] if backgrounds else []
     steps = [

@@ -57,12 +57,12 @@ def detect(
       kpbench detect photos --detector template --patches my-patch.toml
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
-    from kpbench.images import check_apart
+    from kpbench.images import refuse_same_folder
     from kpbench.predictions.files import check_target, write_predictions
 
     check_target(out)
     if overlay is not None:
-        check_apart(source, overlay)
+        refuse_same_folder(source, overlay)
     detector = _told(name, patches, threshold) if patches else name
     try:
         run = _run(source, detector, threshold, overlay, workers)

@@ -92,13 +92,13 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
     except ModuleNotFoundError as error:
         raise click.ClickException(f"kpbench export-model {INSTALL} ({error})") from None
     from kpbench.errors import DataError
-    from kpbench.files import check_targets
+    from kpbench.files import refuse_overwrite
 
     if out.suffix != ".onnx":
         raise DataError(f"{out}: expected a name ending in .onnx")
     if int8 != (checkpoint.suffix == ".onnx"):
         needed = "--int8 takes the .onnx file of export-model, not a checkpoint" if int8 else "is exported already"
         raise DataError(f"{checkpoint}: {needed}; export-model makes CHECKPOINT to .onnx, and --int8 that to integers")
-    check_targets([out], [checkpoint])
+    refuse_overwrite([out], [checkpoint])
     done, model = (export_int8(checkpoint, out), "float32") if int8 else (export(checkpoint, out), "PyTorch")
     click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {model} by at most {done.difference:.1e}")

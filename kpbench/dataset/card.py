@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
 from kpbench.files import write_atomic
+from kpbench.images import encode_png
 from kpbench.types import Float, UInt8
 
 FILES = ("README.md", "preview.png")
@@ -107,8 +107,7 @@ def write_card(dataset: Dataset, folder: Path) -> None:
     DataError
         If they cannot be written.
     """
-    sheet = cv2.cvtColor(overview(dataset, 12, 4, 320), cv2.COLOR_RGB2BGR)
-    write_atomic(folder / FILES[1], cv2.imencode(".png", sheet)[1].tobytes())
+    write_atomic(folder / FILES[1], encode_png(overview(dataset, 12, 4, 320)))
     tables = "\n\n".join(map(_table, histograms(dataset)))
     said = "\n".join(f"| {key} | {value} |" for key, value in facts(dataset).items())
     versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())

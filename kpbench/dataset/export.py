@@ -13,15 +13,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.dataset.card import names, write_card
 from kpbench.dataset.folder import Dataset
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
-from kpbench.types import KEYPOINT_DTYPE, UInt8
+from kpbench.files import make_folder, write_atomic
+from kpbench.images import encode_png
+from kpbench.types import KEYPOINT_DTYPE
 
 Progress = Callable[[int], None]
 
@@ -51,18 +51,10 @@ def export_dataset(dataset: Dataset, form: str, out: str | Path, progress: Progr
     folder = Path(out)
     if folder.is_dir() and any(folder.iterdir()):
         raise DataError(f"{folder}: is not empty; name a new folder with --out")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+    make_folder(folder)
     named = FORMATS[form](dataset, folder, progress)
     write_card(dataset, folder)
     return named
-
-
-def _png(image: UInt8) -> bytes:
-    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".png", pixels)[1])
 
 
 def _boxes(keypoints: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
@@ -86,7 +78,7 @@ def _coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     for n in range(len(dataset)):
         image, keypoints = dataset[n]
         name = f"{ids[n]:08d}.png"
-        write_atomic(folder / "images" / name, _png(image))
+        write_atomic(folder / "images" / name, encode_png(image))
         height, width = image.shape[:2]
         images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height, **_origin(dataset, n)})
         for k, box in zip(keypoints, _boxes(keypoints, width, height), strict=True):
@@ -137,7 +129,7 @@ def _yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
             numbers = [(x + w / 2) / width, (y + h / 2) / height, w / width, h / height]
             numbers += [(k["x"] + 0.5) / width, (k["y"] + 0.5) / height]
             lines.append(f"{classes[int(k['patch_id'])]} {' '.join(f'{v:.9f}' for v in numbers)} 2\n")
-        write_atomic(folder / "images" / f"{ids[n]:08d}.png", _png(image))
+        write_atomic(folder / "images" / f"{ids[n]:08d}.png", encode_png(image))
         write_atomic(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
     listed = "".join(f"  {classes[i]}: {json.dumps(name)}\n" for i, name in called.items())
@@ -157,7 +149,7 @@ def _webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Path:
                 image, keypoints = dataset[n]
                 columns = {name: _numbers(keypoints[name]) for name in KEYPOINT_DTYPE.names or ()}
                 label = {"image_id": int(ids[n]), "keypoints": columns, "degradations": dataset.effects(n)}
-                for suffix, data in (("png", _png(image)), ("json", json.dumps(label, allow_nan=False).encode())):
+                for suffix, data in (("png", encode_png(image)), ("json", json.dumps(label, allow_nan=False).encode())):
                     entry = tarfile.TarInfo(f"{ids[n]:08d}.{suffix}")
                     entry.size = len(data)
                     tar.addfile(entry, io.BytesIO(data))

@@ -34,7 +34,7 @@ from kpbench.dataset.resume import (
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local, write_atomic
+from kpbench.files import folder_at, is_local, make_folder, write_atomic
 from kpbench.workers import Progress, run_jobs
 
 
@@ -110,7 +110,7 @@ def generate(
         If the folder holds another dataset or other files, another run is writing to it, the disk is full, or a
         worker dies; finished shards stay, and the message says how to go on.
     """
-    folder, written = _made(out), config.to_dict()  # lists the backgrounds, before anything is touched
+    folder, written = make_folder(folder_at(out)), config.to_dict()  # lists the backgrounds, before anything is touched
     plan = _plan(config.n, config.shard_size)
     with lock_folder(folder):
         kept = _prepare(folder, written, plan, resume, overwrite)
@@ -144,7 +144,7 @@ def generate_part(
     int
         Number of images that are finished now.
     """
-    folder, written = _made(out), config.to_dict()
+    folder, written = make_folder(folder_at(out)), config.to_dict()
     plan = _plan(config.n, config.shard_size)
     if not (0 <= shards.start < shards.stop <= len(plan)):
         asked = f"{shards.start}:{shards.stop}"
@@ -169,7 +169,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     DataError
         If a shard is missing, damaged, or of another dataset than the first.
     """
-    folder = _made(out)
+    folder = make_folder(folder_at(out))
     with lock_folder(folder):
         for part in map(folder_at, parts):
             for path in sorted(part.glob("shard-*.h5")):
@@ -193,15 +193,6 @@ def _bring(source: Path, target: Path) -> None:
         os.link(source, target)
     except OSError:
         write_atomic(target, source.read_bytes())
-
-
-def _made(out: str | Path) -> Path:
-    folder = folder_at(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
-    return folder
 
 
 def _plan(n: int, shard_size: int) -> list[Piece]:

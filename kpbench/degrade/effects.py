@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 
 from kpbench.geometry.coverage import Box, box_around, coverage, inside_image
+from kpbench.geometry.outline import arc_vertices
+from kpbench.images import encode_jpeg
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -102,11 +104,8 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
 @lru_cache(maxsize=64)
 def disc_kernel(radius_px: float) -> Float:
     """Exact area coverage of a disc about the kernel's centre: an ideal lens out of focus."""
-    angles = np.arange(256) * (2 * np.pi / 256)
     step = 2 * np.pi / 256
-    rim = (
-        radius_px * np.sqrt(step / np.sin(step)) * np.column_stack([np.cos(angles), np.sin(angles)])
-    )  # the disc's area
+    rim = arc_vertices(radius_px, np.arange(256) * step, step)
     reach = int(np.ceil(radius_px)) + 1
     kernel = coverage([[rim]], [(-reach, -reach, 2 * reach + 1, 2 * reach + 1)])[0]
     kernel = kernel + kernel[::-1, ::-1]
@@ -176,10 +175,9 @@ def rainfall(image: UInt8, seed: int, streaks: int, length_px: float, slant_deg:
 
 def jpeg(image: UInt8, quality: int) -> UInt8:
     """Compress and decompress as baseline JPEG of a quality from 1 to 100."""
-    swapped = np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image  # OpenCV's order is BGR
-    packed = cv2.imencode(".jpg", swapped, [cv2.IMWRITE_JPEG_QUALITY, int(quality)])[1]
-    back = np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED), np.uint8)
-    return np.ascontiguousarray(back[..., ::-1]) if image.ndim == 3 else back
+    packed = np.frombuffer(encode_jpeg(image, int(quality)), np.uint8)
+    decoded = np.asarray(cv2.imdecode(packed, cv2.IMREAD_UNCHANGED), np.uint8)
+    return decoded if image.ndim == 2 else np.asarray(cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def low_light(

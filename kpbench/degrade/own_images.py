@@ -6,13 +6,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from kpbench.degrade.ladder import apply, climb
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
-from kpbench.images import Source
+from kpbench.files import make_folder, write_atomic
+from kpbench.images import Source, encode_png
 from kpbench.seeds import stream
 
 
@@ -50,12 +49,8 @@ def degrade_files(
         effects = [climb(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
         image = apply(image, rng, effects)
         target = out / name if name.endswith(".png") else out / f"{name}.png"
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataError(f"{target.parent}: cannot be made, {error.strerror}") from None
-        packed = cv2.imencode(".png", np.ascontiguousarray(image[..., ::-1]) if image.ndim == 3 else image)[1]
-        write_atomic(target, packed.tobytes())
+        make_folder(target.parent)
+        write_atomic(target, encode_png(image))
         yield target, effects
     if broken:
         raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from kpbench.detectors.interface import to_grey
+from kpbench.images import to_grey
 from kpbench.types import Detections, UInt8
 
 

@@ -16,7 +16,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 
 from kpbench import __version__
@@ -179,16 +178,3 @@ def _resolve(path: str) -> Any:
 def one_line(error: BaseException) -> str:
     """The text of an error without line breaks."""
     return " ".join(str(error).split())
-
-
-def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or RGB (H, W, 3) to (H, W).
-
-    Raises
-    ------
-    DataError
-        If the array is no such image.
-    """
-    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
-        raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from kpbench.detectors import verification as verify
 from kpbench.detectors.inference import on_gpu, open_session
-from kpbench.detectors.interface import to_grey
 from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
-from kpbench.images import resize
+from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
 from kpbench.types import Detections, Float, Float32, UInt8
 

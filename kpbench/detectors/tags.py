@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kpbench.detectors.interface import to_grey
 from kpbench.errors import DataError
+from kpbench.images import to_grey
 from kpbench.patches.tag_boards import charuco_pattern, dictionary
 from kpbench.types import Detections, UInt8
 

@@ -15,13 +15,13 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from kpbench.detectors.interface import to_grey
 from kpbench.errors import DataError
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting import sector_search as sectors
 from kpbench.fitting.align import WHOLE_PX, Poses, align, short_axis
 from kpbench.fitting.pyramid import Picture
 from kpbench.fitting.templates import bank
+from kpbench.images import to_grey
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread

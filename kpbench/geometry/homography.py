@@ -37,13 +37,6 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
-def jacobian(H_a2b: Float, point_a: ArrayLike) -> Float:
-    """Derivative of :func:`project` at one point, ndarray of shape (2, 2)."""
-    x, y = np.asarray(point_a, np.float64)
-    mapped = H_a2b @ np.array([x, y, 1.0])
-    return np.asarray((H_a2b[:2, :2] - np.outer(mapped[:2] / mapped[2], H_a2b[2, :2])) / mapped[2])
-
-
 @dataclass(frozen=True)
 class Ellipse:
     """An ellipse in px: centre, semi-axes, and the angle of the major axis in [0, 180) degrees."""

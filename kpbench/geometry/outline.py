@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from kpbench.types import Float
 
@@ -98,6 +99,29 @@ def flatten(region: Region, tolerance: float) -> list[Float]:
     return [np.concatenate([_vertices(part, tolerance) for part in contour]) for contour in region]
 
 
+def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
+    """Return vertices of chords that enclose the same area as the arc.
+
+    The vertices lie outside the circle by the factor ``sqrt(step / sin(step))``. The triangle between two
+    neighbours and the centre then has the area of the sector, ``radius ** 2 * step / 2``.
+
+    Parameters
+    ----------
+    radius : float
+        Radius of the arc about the origin.
+    angles : array_like of shape (N,)
+        Directions of the vertices from +x towards +y, in radians, ``step`` apart.
+    step : float
+        Angle between two neighbours in radians, more than 0 and less than pi.
+
+    Returns
+    -------
+    ndarray of shape (N, 2)
+    """
+    raised = float(radius * np.sqrt(step / np.sin(step)))
+    return np.asarray(raised * np.column_stack([np.cos(angles), np.sin(angles)]))
+
+
 def _vertices(part: Line | Arc, tolerance: float) -> Float:
     """Vertices of one segment without its end point, which is the next segment's start."""
     if isinstance(part, Line):
@@ -107,10 +131,7 @@ def _vertices(part: Line | Arc, tolerance: float) -> Float:
     count = max(2, int(np.ceil(abs(np.radians(part.sweep_deg)) / (2 * half))))
     step = np.radians(part.sweep_deg) / count
     angles = np.radians(part.start_deg) + step * np.arange(count)
-    radius = np.full(count, part.radius * np.sqrt(abs(step) / np.sin(abs(step))))
-    if abs(part.sweep_deg) < 360:
-        radius[0] = part.radius
-    points = np.column_stack([part.x + radius * np.cos(angles), part.y + radius * np.sin(angles)])
+    points: Float = arc_vertices(part.radius, angles, abs(step)) + np.array([part.x, part.y])
     if abs(part.sweep_deg) < 360:
         points[0] = part.point(0.0)
     return points

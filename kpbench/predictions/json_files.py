@@ -14,7 +14,7 @@ from kpbench.errors import PredictionsError
 from kpbench.predictions.coco import coco_results
 from kpbench.predictions.decode import PIECE_BYTES, cut, kind, parse, records, typed
 from kpbench.predictions.header import SCHEMA, header_of, read_header
-from kpbench.types import Float, Int, Misfit, Predictions, offsets_of
+from kpbench.types import Float, Int, InvalidValue, Predictions, offsets_of
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
@@ -145,7 +145,7 @@ def _from_batches(batches: Iterable[list[Record]], header: dict[str, Any], place
             patch_id=patch_id if named else None,
             **header,
         )
-    except Misfit as error:
+    except InvalidValue as error:
         raise PredictionsError(f"{place(error.image)} (image_id {error.image_id}): {error.problem}") from None
 
 

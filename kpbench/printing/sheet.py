@@ -18,7 +18,7 @@ from typing import Any
 
 from kpbench import __version__
 from kpbench.errors import DesignError
-from kpbench.files import write_atomic
+from kpbench.files import make_folder, write_atomic
 from kpbench.geometry.outline import Line, Region, circle, move, rectangle
 from kpbench.patches.board import Board
 from kpbench.patches.design import Patch
@@ -221,26 +221,22 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
 
     Raises
     ------
-    DesignError
+    DataError
         If a file cannot be written.
     """
-    folder = Path(folder)
+    folder = make_folder(Path(folder))
     stem = file_stem(sheet.name)
     sidecar = dict(sheet.sidecar)
     if ".png" in suffixes:
         sidecar["png"] = {"dpi": dpi, "px_per_mm": px_per_mm(dpi)}
     written = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for suffix in suffixes:
-            contents = WRITERS[suffix](sheet.pages, dpi)
-            for n, content in enumerate(contents, 1):
-                written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
-                write_atomic(written[-1], content)
-        written.append(folder / f"{stem}.json")
-        write_atomic(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
-    except OSError as error:
-        raise DesignError(f"{error.filename or folder}: cannot be written ({error.strerror})") from None
+    for suffix in suffixes:
+        contents = WRITERS[suffix](sheet.pages, dpi)
+        for n, content in enumerate(contents, 1):
+            written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
+            write_atomic(written[-1], content)
+    written.append(folder / f"{stem}.json")
+    write_atomic(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
     return written
 
 

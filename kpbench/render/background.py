@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
+from kpbench.images import decode_photo
 from kpbench.types import Float, UInt8
 
 CACHE_BYTES = 128 * 2**20
@@ -119,19 +120,6 @@ class PhotoFolder:
                 return Background(np.ascontiguousarray(image[:, ::-1]) if mirror else image, name, tuple(broken))
             broken.append(name)
         raise DataError(f"{self.path}: its image files can no longer be decoded")
-
-
-def decode_photo(path: Path, channels: int) -> UInt8 | None:
-    """Decode a photograph as grey (channels 1) or RGB (3), whatever its EXIF says; None if it cannot be decoded."""
-    flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
-        return None
-    if image is None or min(image.shape[:2]) < 8:
-        return None
-    return np.asarray(image if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _crop(photo: UInt8, width_px: int, height_px: int, zoom: float, fx: float, fy: float) -> UInt8:

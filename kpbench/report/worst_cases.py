@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from kpbench.images import encode_jpeg
 from kpbench.scoring.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS
 from kpbench.scoring.metrics import SUMS
 from kpbench.scoring.outcomes import Tally
@@ -125,5 +126,4 @@ def _jpeg(image: UInt8) -> bytes:
     scale = MOST_SIDE_PX / max(image.shape[:2])
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    return encode_jpeg(image, JPEG_QUALITY)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.degrade.weather import albumentations
-from kpbench.errors import AugmentationError, DataError
+from kpbench.errors import DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project
 from kpbench.render.scene import Placement
@@ -92,7 +92,7 @@ def augment(
 
     Raises
     ------
-    AugmentationError
+    DataError
         If a transform raises, gives an image of another shape or type, or mirrors a patch, which makes it another
         design.
     """
@@ -103,13 +103,11 @@ def augment(
     except Exception as error:  # whatever a transform raises
         said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
         hint = "; some transforms work with --channels 3 only" if image.ndim == 2 else ""
-        raise AugmentationError(f"--augment: {said}{hint}") from None
+        raise DataError(f"--augment: {said}{hint}") from None
     result, came_from = np.ascontiguousarray(done["image"]), done["mask"]
     if result.shape != image.shape or result.dtype != np.uint8:
         given, asked = (f"{'x'.join(map(str, a.shape[1::-1]))} {a.dtype}" for a in (result, image))
-        raise AugmentationError(
-            f"--augment: makes {given} of {asked}; end the pipeline with a resize or crop to that size"
-        )
+        raise DataError(f"--augment: makes {given} of {asked}; end the pipeline with a resize or crop to that size")
     if np.array_equal(came_from, origin):
         return result, list(placements)
     return result, [_carried(placement, came_from) for placement in placements]
@@ -138,7 +136,7 @@ def _carried(placement: Placement, came_from: NDArray[np.float32]) -> Placement 
         return None
     found = np.asarray(fitted, np.float64)
     if np.linalg.det(found[:2, :2]) < 0:
-        raise AugmentationError(
+        raise DataError(
             "--augment: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
         )
     # where the move is no homography, the centre counts

@@ -17,8 +17,9 @@ import numpy as np
 
 from kpbench.degrade.ladder import paper_mix
 from kpbench.errors import DataError
+from kpbench.images import decode_photo
 from kpbench.patches.design import Patch
-from kpbench.render.background import PhotoFolder, decode_photo, procedural
+from kpbench.render.background import PhotoFolder, procedural
 from kpbench.render.scene import Limits, random_placements, render_scene
 from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.types import Float32, UInt8

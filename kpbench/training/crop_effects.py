@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kpbench.degrade.effects import BORDER, box_taps, line_kernel
+from kpbench.degrade.effects import BORDER, box_taps, jpeg, line_kernel
 from kpbench.types import Float32, UInt8
 
 
@@ -48,8 +48,7 @@ def degrade_crop(
     result = np.clip(np.rint(work), 0, 255).astype(np.uint8)
     if rng.random() < 0.25 * severity:
         quality = int(rng.uniform(25, 95))
-        coded = cv2.imencode(".jpg", result, (cv2.IMWRITE_JPEG_QUALITY, quality))[1]
-        result = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE), np.uint8)
+        result = jpeg(result, quality)
         sigma += (100 - quality) / 15
     return result, gain, kernel, sigma
 

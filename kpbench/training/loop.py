@@ -26,6 +26,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from kpbench.errors import DataError
+from kpbench.files import make_folder
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.training.batches import Job, load_photos, make_batch, training_batches
 from kpbench.training.checkpoint import State, designs_digest, read_checkpoint, save_checkpoint
@@ -233,10 +234,7 @@ def train(
         raise DataError(f"{checkpoint}: there is a training in this folder; use --resume, or another folder")
     if resume_run and not checkpoint.exists():
         raise DataError(f"{checkpoint}: nothing to go on from yet; leave --resume out")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+    make_folder(folder)
     state = start(recipe, device)
     if resume_run:
         resume(state, checkpoint, designs)

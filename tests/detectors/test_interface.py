@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from kpbench.detectors import prediction as pipeline
-from kpbench.detectors.interface import LoadedDetector, load_detector, to_grey
+from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
+from kpbench.images import to_grey
 from kpbench.types import Detections
 
 MODULE = """

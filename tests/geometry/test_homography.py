@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
-from kpbench.geometry.homography import jacobian, project, projected_disc
+from kpbench.geometry.homography import project, projected_disc
 
 angles = st.floats(-70, 70)
 
@@ -30,19 +30,6 @@ def test_projected_disc_agrees_with_projected_rim_points(x_deg, y_deg, z_deg, de
 def test_a_disc_that_reaches_the_horizon_is_refused():
     with pytest.raises(ValueError, match="horizon"):
         projected_disc(homography(80, 0, 0, 0.5))
-
-
-@given(angles, angles, st.floats(-1, 1), st.floats(-1, 1))
-def test_jacobian_is_the_derivative(x_deg, y_deg, u, v):
-    H = homography(x_deg, y_deg, 20, 8)
-    step = 1e-6
-    numeric = np.column_stack(
-        [
-            (project(H, [[u + step, v]]) - project(H, [[u - step, v]]))[0] / (2 * step),
-            (project(H, [[u, v + step]]) - project(H, [[u, v - step]]))[0] / (2 * step),
-        ]
-    )
-    assert np.allclose(jacobian(H, [u, v]), numeric, rtol=1e-5, atol=1e-5)
 
 
 def test_the_principal_point_is_the_middle_of_the_pixel_grid():

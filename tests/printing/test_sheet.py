@@ -11,7 +11,7 @@ import pytest
 import readers
 from PIL import Image
 
-from kpbench.errors import DesignError
+from kpbench.errors import DataError, DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import parse_patch, shipped_patches
@@ -263,7 +263,7 @@ def test_file_names(tmp_path):
 
 def test_a_folder_that_cannot_be(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(DesignError, match="file: cannot be written"):
+    with pytest.raises(DataError, match="file: cannot be made"):
         save_sheet(SHEETS["mixed"], tmp_path / "file", [".svg"])
 
 

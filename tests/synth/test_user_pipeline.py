@@ -5,7 +5,7 @@ import pytest
 from helpers import kpbench
 
 from kpbench.dataset.folder import open_dataset
-from kpbench.errors import AugmentationError
+from kpbench.errors import DataError
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting.pyramid import pyramid
 from kpbench.patches.design import shipped_patches
@@ -72,7 +72,7 @@ def test_what_moves_nothing_leaves_the_truth_as_it_is(tmp_path):
 )
 def test_what_cannot_be_carried_is_refused(name, options, said, tmp_path):
     canonical = load_augmentation(saved(tmp_path, (name, options)))
-    with pytest.raises(AugmentationError) as refused:
+    with pytest.raises(DataError) as refused:
         augment(*scene(1), canonical, 0)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
