@@ -1,5 +1,6 @@
 """What tests of several rooms make and call."""
 
+import click
 import numpy as np
 from click.testing import CliRunner
 
@@ -16,6 +17,13 @@ def kpbench(*arguments, code=0):
     assert isinstance(result.exception, SystemExit | None), result.exception
     assert result.exit_code == code, result.output
     return result
+
+
+def command(name):
+    """Import the click command of this name."""
+    found = main.get_command(click.Context(main), name)
+    assert found, name
+    return found
 
 
 def digests(folder):

@@ -17,22 +17,22 @@ from kpbench.errors import KpbenchError
 # must not wait for OpenCV, HDF5 or torch. The second entry is its line in the list of commands.
 COMMANDS = {
     "render-patches": ("print:render_patches", "Print the patches or a board, true to scale."),
-    "analyze-patches": ("analyze:analyze_patches", "Measure designs: localisation, confusion, look-alikes."),
+    "analyze-patches": ("analyze:analyze_patches", "Measure how well designs can be located and told apart."),
     "synth": ("synth:synth", "Write a synthetic labelled dataset."),
-    "merge": ("synth:merge", "Make one dataset of shards made in parts."),
+    "merge": ("synth:merge", "Make one dataset of shards that several runs made."),
     "suite": ("suite:suite", "Write the images of a benchmark suite: paper-v1, extended-v1."),
-    "degrade": ("degrade:degrade", "Blur, dim, wet, ... images of your own."),
-    "inspect": ("dataset:inspect", "Say what is in a dataset."),
-    "verify": ("dataset:verify", "Check every byte of a dataset."),
+    "degrade": ("degrade:degrade", "Degrade images of your own: blur, noise, rain, ..."),
+    "inspect": ("dataset:inspect", "Print what a dataset holds."),
+    "verify": ("dataset:verify", "Compare every byte of a dataset with its manifest."),
     "preview": ("dataset:preview", "Draw a contact sheet with the true keypoints."),
     "export": ("dataset:export", "Write a dataset as COCO, YOLO-pose or WebDataset."),
     "detect": ("detecting:detect", "Run a detector over a dataset or image files."),
     "score": ("score:score", "Score a predictions file with the paper's metrics."),
     "compare": ("compare:compare", "Compare detectors on the same images, pair by pair."),
-    "bench": ("benchmark:bench", "Suites, detectors and scores in one go, beside the paper's tables."),
+    "bench": ("benchmark:bench", "Make suites, run detectors, score them beside the paper."),
     "train": ("training:train", "Train the detector; needs kpbench[train]."),
     "export-model": ("training:export_model", "Write trained weights as an ONNX file."),
-    "demo": ("demo:demo", "The whole chain, small, in about a minute."),
+    "demo": ("demo:demo", "Run the whole chain with few images, in about a minute."),
 }
 
 

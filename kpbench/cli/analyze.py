@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from kpbench.cli.options import BACKGROUNDS
+
 if TYPE_CHECKING:
     from kpbench.analysis.measures import Analysis
     from kpbench.analysis.search import SearchResult
@@ -19,15 +21,17 @@ if TYPE_CHECKING:
 @click.command("analyze-patches")
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--search", "searching", is_flag=True, help="Repeat the search that chose the shipped designs.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), help="All measures as JSON.")
-@click.option("--figure", type=click.Path(path_type=Path), help="One page, .svg, .png or .pdf.")
-@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all measures as JSON.")
+@click.option(
+    "--figure", type=click.Path(path_type=Path), help="Draw the designs and their measures: .svg, .png, .pdf."
+)
+@BACKGROUNDS
 def analyze_patches(
     files: tuple[Path, ...], searching: bool, json_file: Path | None, figure: Path | None, backgrounds: Path | None
 ) -> None:
-    """Measure designs: localisation, confusion, look-alikes in images.
+    """Measure how well designs can be located, told apart, and told from natural images.
 
-    FILES are designs (TOML); without them, the shipped ones.
+    FILES are designs (TOML). Default: the shipped four.
 
     \b
     Examples:

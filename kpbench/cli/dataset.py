@@ -12,10 +12,10 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @click.command()
 @DATASET
 def inspect(dataset: Path) -> None:
-    """Say what is in a dataset: size, counts, and how its keypoints are distributed.
+    """Print what a dataset holds: its size, its counts, and histograms of its keypoints.
 
     \b
-    Example:
+    Examples:
       kpbench inspect kpbench-data
     """
     from kpbench.dataset.card import facts, histograms
@@ -35,10 +35,10 @@ def inspect(dataset: Path) -> None:
 @click.command()
 @DATASET
 def verify(dataset: Path) -> None:
-    """Check every byte of a dataset against its manifest; exit 1 at the first that differs.
+    """Compare every byte of a dataset with its manifest. The exit code is 1 if a byte differs.
 
     \b
-    Example:
+    Examples:
       kpbench verify kpbench-data
     """
     from kpbench.cli.progress import progress_bar
@@ -53,17 +53,17 @@ def verify(dataset: Path) -> None:
 
 @click.command()
 @DATASET
-@click.option("--out", type=click.Path(path_type=Path), help="PNG file; default: preview.png in the dataset.")
-@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Images on the sheet.")
-@click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True)
+@click.option("--out", type=click.Path(path_type=Path), help="PNG file to write. Default: preview.png in the dataset.")
+@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Number of images.")
+@click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True, help="Number of images per row.")
 @click.option(
-    "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image, px."
+    "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image in px."
 )
 def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
     """Draw a contact sheet of evenly spaced images with their true keypoints.
 
     \b
-    Example:
+    Examples:
       kpbench preview kpbench-data --count 20 --columns 5
     """
     from kpbench.dataset.card import overview
@@ -80,14 +80,17 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
 
 @click.command()
 @DATASET
-@click.option("--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True)
-@click.option("--out", type=click.Path(path_type=Path), help="New folder; default: DATASET-FORMAT.")
+@click.option(
+    "--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True, help="Format to write."
+)
+@click.option("--out", type=click.Path(path_type=Path), help="New folder to write into. Default: DATASET-FORMAT.")
 def export(dataset: Path, form: str, out: Path | None) -> None:
     """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
 
     \b
-    Example:
+    Examples:
       kpbench export kpbench-data --format coco
+      kpbench export val --format yolo --out val-yolo
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.export import export_dataset

@@ -12,22 +12,26 @@ from kpbench.cli.options import FINITE, SEED
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option(
-    "--effect", "effects", multiple=True, required=True, help="An effect of the ladder; repeatable, in order."
+    "--effect", "effects", multiple=True, required=True, help="Effect; repeatable. Effects are applied in this order."
 )
-@click.option("--level", "levels", type=FINITE, multiple=True, required=True, help="Its level; one for each effect.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("degraded"), show_default=True, help="Folder.")
+@click.option(
+    "--level", "levels", type=FINITE, multiple=True, required=True, help="Level of the effect; one for each --effect."
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("degraded"), show_default=True, help="Folder to write into."
+)
 @SEED
 def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
     """Degrade an image, or all images of a folder, and write them as PNG.
 
-    Prints one line an image: the file, and what was applied as JSON.
+    Prints one line per image: the file that was written, then the applied effects as JSON.
 
     \b
     Effects and their rungs in the suites:
       blur 3 7 11 15 px · dimming 10 20 30 40 · noise 15 30 45 60 grey levels · motion-blur 5 10 20 30 px
       defocus 2 4 6 9 px · shadow-edge 30 50 70 90 % · rain 500 1000 2000 4000 · jpeg 50 25 10 5
       low-light 4 6 8 9 stops · occlusion 10 20 30 40 % · flare 60 120 180 240
-      gaussian-blur and dimming-literal are in none
+      gaussian-blur and dimming-literal are in no suite
 
     \b
     Examples:

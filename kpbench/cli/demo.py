@@ -1,4 +1,4 @@
-"""The whole chain, small."""
+"""``kpbench demo``."""
 
 from __future__ import annotations
 
@@ -6,18 +6,26 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.options import BACKGROUNDS
+
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), default=Path("kpbench-demo"), show_default=True)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("kpbench-demo"),
+    show_default=True,
+    help="Folder to write into.",
+)
 @click.option("--n", type=click.IntRange(1, 100_000), default=100, show_default=True, help="Number of images.")
-@click.option("--detector", default="template", show_default=True)
-@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@click.option("--detector", default="template", show_default=True, help="Detector, as for kpbench detect.")
+@BACKGROUNDS
 @click.pass_context
 def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path | None) -> None:
-    """Print, synthesise, detect and score: the whole chain, small, in about a minute.
+    """Print, synthesise, detect and score: the whole chain with few images, in about a minute.
 
     \b
-    Example:
+    Examples:
       kpbench demo
     """
     from kpbench.cli import main

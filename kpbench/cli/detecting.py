@@ -23,7 +23,13 @@ if TYPE_CHECKING:
     show_default=True,
     help="By name, FILE.onnx, MODULE:ATTR or program:COMMAND.",
 )
-@click.option("--out", type=click.Path(dir_okay=False, path_type=Path), default=Path("preds.json"), show_default=True)
+@click.option(
+    "--out",
+    type=click.Path(dir_okay=False, path_type=Path),
+    default=Path("preds.json"),
+    show_default=True,
+    help="Predictions file to write.",
+)
 @click.option(
     "--threshold",
     type=FINITE,

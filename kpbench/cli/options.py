@@ -13,7 +13,7 @@ Number = TypeVar("Number", bound=float)
 
 
 class Two(click.ParamType[tuple[Number, Number]], Generic[Number]):
-    """Two numbers with a separator between them, as a tuple."""
+    """Two numbers with a separator between them; the value is a tuple."""
 
     def __init__(self, kind: type[Number], name: str, separator: str, example: str) -> None:
         self.kind, self.name, self.separator, self.example = kind, name, separator, example
@@ -29,7 +29,7 @@ class Two(click.ParamType[tuple[Number, Number]], Generic[Number]):
 
 
 class Names(click.ParamType[tuple[str, ...]]):
-    """Names with commas between them, as a tuple."""
+    """Names with commas between them; the value is a tuple."""
 
     name = "NAME,…"
 
@@ -38,7 +38,7 @@ class Names(click.ParamType[tuple[str, ...]]):
 
 
 class Finite(click.FloatRange):
-    """A number within a range that is neither nan nor infinite, which click lets pass."""
+    """A number within a range. Unlike ``click.FloatRange`` it refuses nan and infinity."""
 
     def _describe_range(self) -> str:
         return "" if self.min is self.max is None else super()._describe_range()
@@ -53,27 +53,42 @@ class Finite(click.FloatRange):
 SIZE = Two(int, "WxH", "x", "640x480")
 SHARDS = Two(int, "A:B", ":", "0:10")
 FINITE = Finite()
-ONLY = click.option("--only", type=Names(), default="", help="Only these conditions, such as scale,blur.")
-SEED = click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
-WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Processes; default: one a core.")
+BACKGROUNDS = click.option(
+    "--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs. Default: procedural backgrounds."
+)
+ONLY = click.option(
+    "--only", type=Names(), default="", help="Only these conditions, such as scale,blur. Default: all conditions."
+)
+SEED = click.option(
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of everything that is random."
+)
+WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes. Default: one per core.")
 PATCHES = click.option(
     "--patches",
     type=click.Path(path_type=Path),
     multiple=True,
     metavar="FILE|DIR",
-    help="Your own design (TOML), or a folder of them; repeatable. Default: the shipped four.",
+    help="Design of your own (TOML), or a folder of designs; repeatable. Default: the shipped four.",
 )
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Options of every command that writes a dataset: how, and what to do with what is there."""
+    """Add the options of every command that writes a dataset: where it is made, and what happens to an earlier run."""
     for option in reversed((
         WORKERS,
-        click.option("--engine", type=click.Choice(["local", "dask"]), default="local", show_default=True),
-        click.option("--scheduler", metavar="ADDR", help="Of Dask, such as tcp://host:8786."),
-        click.option("--shard-range", type=SHARDS, help="Only these shards, from 0; put together by kpbench merge."),
-        click.option("--resume", is_flag=True, help="Finish an interrupted run."),
-        click.option("--overwrite", is_flag=True, help="Replace the dataset in the folder."),
+        click.option(
+            "--engine",
+            type=click.Choice(["local", "dask"]),
+            default="local",
+            show_default=True,
+            help="Where shards are made: in processes of this machine, or by the workers of a Dask cluster.",
+        ),
+        click.option("--scheduler", metavar="ADDR", help="Address of the Dask scheduler, such as tcp://host:8786."),
+        click.option(
+            "--shard-range", type=SHARDS, help="Make only shards A to B - 1, counted from 0. kpbench merge joins them."
+        ),
+        click.option("--resume", is_flag=True, help="Keep the finished shards of an interrupted run, make the rest."),
+        click.option("--overwrite", is_flag=True, help="Delete the dataset in the folder first."),
     )):  # fmt: skip
         command = option(command)
     return command

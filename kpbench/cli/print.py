@@ -12,36 +12,50 @@ from kpbench.cli.options import Finite, Two
 
 @click.command("render-patches")
 @click.option(
-    "--out", type=click.Path(path_type=Path), default=Path("patches-print"), show_default=True, help="Folder."
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("patches-print"),
+    show_default=True,
+    help="Folder to write into.",
 )
-@click.option("--pdf", is_flag=True, help="Vector PDF that asks the viewer not to scale (default).")
-@click.option("--svg", is_flag=True, help="SVG in mm with true arcs.")
-@click.option("--png", is_flag=True, help="8-bit grey PNG with its resolution.")
-@click.option("--dxf", is_flag=True, help="DXF in mm with true arcs, for laser and plotter.")
+@click.option(
+    "--pdf", is_flag=True, help="Write a vector PDF that asks the viewer not to scale. This is the default format."
+)
+@click.option("--svg", is_flag=True, help="Write SVG in mm with true arcs.")
+@click.option("--png", is_flag=True, help="Write 8-bit grey PNG that holds its resolution.")
+@click.option("--dxf", is_flag=True, help="Write DXF in mm with true arcs, for laser cutters and plotters.")
 @click.option(
     "--diameter-mm",
     type=Finite(0.1, 5000),
     metavar="MM",
-    help="Diameter of the disc; rim and quiet zone come on top. A hexagon's side is DIAMETER / 0.16.  [default: 30]",
+    help="Diameter of a disc, without rim and quiet zone. Default: 30. The side of a hexagon board is MM / 0.16.",
 )
-@click.option("--page", default="a4", show_default=True, help="a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
-@click.option("--landscape", is_flag=True, help="Turn the page.")
-@click.option("--dpi", type=click.IntRange(36, 4800), default=600, show_default=True, help="Resolution of PNG.")
-@click.option("--board", metavar="hexagon|grid|FILE.toml", help="A board instead of patches to cut out.")
-@click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over pages.")
+@click.option("--page", default="a4", show_default=True, help="Page: a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
+@click.option("--landscape", is_flag=True, help="Use the page in landscape format.")
+@click.option("--dpi", type=click.IntRange(36, 4800), default=600, show_default=True, help="Resolution of the PNG.")
+@click.option("--board", metavar="hexagon|grid|FILE.toml", help="Print a board instead of patches to cut out.")
+@click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
-    "--design", "designs", type=click.Path(path_type=Path), multiple=True, help="Your own design (TOML); repeatable."
+    "--design",
+    "designs",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Design of your own (TOML); repeatable. Default: the shipped four.",
 )
-@click.option("--patch", "chosen", multiple=True, metavar="NAME|ID", help="Only this design; repeatable.")
+@click.option("--patch", "chosen", multiple=True, metavar="NAME|ID", help="Print only this design; repeatable.")
 @click.option(
-    "--copies", type=click.IntRange(1, 10_000), default=1, show_default=True, help="Of each patch to cut out."
+    "--copies",
+    type=click.IntRange(1, 10_000),
+    default=1,
+    show_default=True,
+    help="Number of copies of each patch to cut out.",
 )
 @click.option("--mirror", is_flag=True, help="Swap left and right, for transfer film.")
-@click.option("--no-labels", is_flag=True, help="No text; rulers and cut marks stay.")
+@click.option("--no-labels", is_flag=True, help="Print no text. Rulers and cut marks stay.")
 @click.option(
     "--measured",
     type=Two(float, "X_MM,Y_MM", ",", "99.8,100.1"),
-    help="Lengths of the two rulers on the paper: corrects the sidecars in --out, prints nothing anew.",
+    help="Lengths of the two rulers on the paper. Corrects the sidecars in --out and prints nothing.",
 )
 @click.pass_context
 def render_patches(
@@ -66,8 +80,8 @@ def render_patches(
 ) -> None:
     """Print the patches or a board, true to scale.
 
-    Writes ./patches-print/patches.pdf, and beside it patches.json with the position of every
-    keypoint. Print at 100 %, then measure the two rulers on the paper.
+    Writes ./patches-print/patches.pdf, and patches.json with the position of every keypoint. Print at 100 %, then
+    measure the two rulers on the paper.
 
     \b
     Examples:

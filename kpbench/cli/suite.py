@@ -7,11 +7,11 @@ from typing import Any
 
 import click
 
-from kpbench.cli.options import ONLY, SEED, SIZE, run_options
+from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, run_options
 
 
 class Distortion(click.ParamType[tuple[float, ...]]):
-    """``k1,k2,p1,p2,k3`` as a tuple; trailing ones may be left out."""
+    """One to five numbers ``k1,k2,p1,p2,k3``; the value is a tuple."""
 
     name = "k1,k2,p1,p2,k3"
 
@@ -29,14 +29,24 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 
 @click.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder; default: kpbench-suite/NAME.")
-@click.option("--images", type=int, help="Base scenes, each seen with every patch under every rung; default: 500.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to write into. Default: kpbench-suite/NAME.")
+@click.option(
+    "--images",
+    type=int,
+    help="Number of base scenes. Each is seen with every patch under every rung. Default: 500, or as the file says.",
+)
 @SEED
-@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
-@click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
+@BACKGROUNDS
+@click.option(
+    "--size", type=SIZE, help="Width and height in px of a camera with the same field of view. Default: 1624x1240."
+)
 @ONLY
-@click.option("--distortion", type=Distortion(), help="Lens distortion as OpenCV's coefficients; default: none.")
-@click.option("--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Tags in the place of patches.")
+@click.option(
+    "--distortion", type=Distortion(), help="Lens distortion, by the coefficients of OpenCV. Default: no distortion."
+)
+@click.option(
+    "--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Show a board of tags instead of the patches."
+)
 @run_options
 def suite(
     name: str,
@@ -50,7 +60,9 @@ def suite(
     board: str | None,
     **run: Any,
 ) -> None:
-    """Write the images of a benchmark suite: paper-v1, extended-v1, or a .toml file of your own.
+    """Write the images of a benchmark suite into a dataset folder.
+
+    NAME is paper-v1, extended-v1, or a .toml file of your own.
 
     \b
     Examples:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kpbench.cli.options import PATCHES, SEED, SIZE, Two, run_options
+from kpbench.cli.options import BACKGROUNDS, PATCHES, SEED, SIZE, Two, run_options
 
 if TYPE_CHECKING:
     from kpbench.dataset.folder import Dataset
@@ -22,40 +22,42 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     default=Path("kpbench-data"),
     show_default=True,
-    help="Folder, or a URL such as s3://bucket/name (pip install 'kpbench[remote]').",
+    help="Folder to write into, or a URL such as s3://bucket/name (pip install 'kpbench[remote]').",
 )
 @SEED
-@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@BACKGROUNDS
 @PATCHES
-@click.option("--size", type=SIZE, default="640x480", show_default=True)
-@click.option("--channels", type=int, default=1, show_default=True, help="1 grey, 3 RGB.")
+@click.option("--size", type=SIZE, default="640x480", show_default=True, help="Width and height of an image in px.")
+@click.option("--channels", type=int, default=1, show_default=True, help="1 for grey images, 3 for RGB.")
 @click.option(
     "--deteriorate",
     type=click.Choice(["none", "paper", "ladder"]),
     default="paper",
     show_default=True,
-    help="none; as the paper does; or one or two effects of kpbench degrade, from nothing to their last rung.",
+    help="none; paper: as the paper does; ladder: one or two effects of kpbench degrade, mild to severe.",
 )
 @click.option(
     "--radius-px",
     type=Two(float, "LEAST:MOST", ":", "5:80"),
     default="5:80",
     show_default=True,
-    help="Of the discs before tilt. No short semi-axis is under the least of them or 5 px, whichever is less.",
+    help="Radii of the discs before tilt, in px. The short semi-axis stays at least LEAST, or 5 px if LEAST is more.",
 )
 @click.option(
     "--distractors",
     type=click.IntRange(0, 1000),
     default=0,
     show_default=True,
-    help="Up to so many look-alikes an image, without a label: discs, rings, half-patches, chequers, text.",
+    help="Most look-alikes per image: discs, rings, half-patches, chequers, text. They have no label.",
 )
 @click.option(
     "--augment",
     type=click.Path(path_type=Path),
-    help="Your own albumentations pipeline, as albumentations.save writes it (JSON or YAML), applied last.",
+    help="albumentations pipeline of your own, as albumentations.save writes it (JSON or YAML). It is applied last.",
 )
-@click.option("--shard-size", type=int, default=500, show_default=True, help="Images a file.")
+@click.option(
+    "--shard-size", type=int, default=500, show_default=True, help="Number of images per shard, which is a file."
+)
 @run_options
 def synth(
     n: int,
@@ -107,9 +109,10 @@ def synth(
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.argument("parts", nargs=-1, type=click.Path(path_type=Path))
 def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
-    """Make one dataset of shards that --shard-range made: check that all are there, write the manifest.
+    """Make one dataset of the shards that several runs with --shard-range made.
 
-    PARTS are folders whose shards are linked or copied into DATASET; none where all parts wrote into it.
+    Checks that every shard is there and undamaged, then writes the manifest. PARTS are folders; their shards are
+    linked or copied into DATASET. Leave PARTS out if all runs wrote into DATASET.
 
     \b
     Examples:

@@ -42,7 +42,7 @@ def train(
     """Train the detector on samples that are made on the fly; any run can be resumed to the bit.
 
     \b
-    Example:
+    Examples:
       kpbench train --config configs/reference.toml --backgrounds photos/ --minutes 30
       kpbench train --config configs/reference.toml --backgrounds photos/ --resume
       torchrun --nproc-per-node 4 -m kpbench train --config configs/reference.toml --workers 4
@@ -82,7 +82,7 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
     With --int8 that file is read instead of a checkpoint.
 
     \b
-    Example:
+    Examples:
       kpbench export-model runs/superpoint-small/checkpoint.safetensors --out superpoint-small.onnx
       kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
     """

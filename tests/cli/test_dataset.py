@@ -6,8 +6,6 @@ import cv2
 import pytest
 from helpers import kpbench
 
-from kpbench.cli import COMMANDS
-
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
@@ -71,13 +69,6 @@ def test_a_second_synth_into_the_folder_changes_nothing(dataset):
 )
 def test_wrong_usage_is_exit_code_2(arguments):
     kpbench(*arguments, code=2)
-
-
-@pytest.mark.parametrize("command", COMMANDS)
-def test_every_command_has_help_with_an_example(command):
-    result = kpbench(command, "--help")
-    assert "Example" in result.stdout
-    assert f"kpbench {command}" in result.stdout
 
 
 def test_without_a_terminal_stderr_stays_empty(tmp_path):

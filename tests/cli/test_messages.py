@@ -1,14 +1,8 @@
-import importlib
-
 import pytest
+from helpers import command
 
 from kpbench.cli import COMMANDS
 from kpbench.cli.messages import OPTION_OF, name_options
-
-
-def command(name):
-    module, attribute = COMMANDS[name][0].split(":")
-    return getattr(importlib.import_module(f"kpbench.cli.{module}"), attribute)
 
 
 @pytest.mark.parametrize(
