@@ -19,7 +19,7 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 
 @dataclass(frozen=True)
-class Source:
+class ImageSource:
     """Named images in order: RGB or grey uint8, or None for a file that cannot be decoded.
 
     ``length`` is their number, None where nobody knows it; ``fps`` that of a video or camera, else None.
@@ -30,7 +30,7 @@ class Source:
     fps: float | None = None
 
 
-def open_images(source: str, but: Path | None = None) -> Source:
+def open_images(source: str, but: Path | None = None) -> ImageSource:
     """Images of ``camera:N``, a video file, an image file, or a folder (by name, subfolders too, ``but`` for one).
 
     Raises
@@ -48,7 +48,7 @@ def open_images(source: str, but: Path | None = None) -> Source:
         files = image_files(path, but)
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
-        return Source(((name, _decode(path / name)) for name in files), len(files))
+        return ImageSource(((name, _decode(path / name)) for name in files), len(files))
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEOS:
@@ -57,7 +57,7 @@ def open_images(source: str, but: Path | None = None) -> Source:
     image = _decode(path)
     if image is None:
         raise DataError(f"{path}: cannot be decoded as an image")
-    return Source(iter([(path.name, image)]), 1)
+    return ImageSource(iter([(path.name, image)]), 1)
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:
@@ -81,7 +81,7 @@ def _decode(path: Path) -> UInt8 | None:
     return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> Source:
+def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> ImageSource:
     if not capture.isOpened():
         raise DataError(f"{name}: cannot be opened as a video")
 
@@ -95,7 +95,7 @@ def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> Source:
             yield f"{number:08d}.png", np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
             number += 1
 
-    return Source(frames(), length if length and length > 0 else None, capture.get(cv2.CAP_PROP_FPS) or 25.0)
+    return ImageSource(frames(), length if length and length > 0 else None, capture.get(cv2.CAP_PROP_FPS) or 25.0)
 
 
 @contextmanager

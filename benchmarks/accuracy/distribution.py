@@ -14,7 +14,7 @@ import argparse
 import numpy as np
 
 import kpbench
-from kpbench.geometry.homography import projected_discs
+from kpbench.geometry.homography import project_discs
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, random_placements
 from kpbench.seeds import SYNTH_SCENE, stream
@@ -53,7 +53,7 @@ def main() -> None:
     r = np.corrcoef(tilts.T)[0, 1]
     print(f"tilts: {np.abs(tilts).max():.1f} degrees at most, correlation of the two {r:+.4f} "
           f"(chance alone: {1 / np.sqrt(len(tilts)):.4f})")  # fmt: skip
-    centre, reach, _, _ = projected_discs(keypoints["H_patch2image"])
+    centre, reach, _, _ = project_discs(keypoints["H_patch2image"])
     gaps = []
     for low, high in zip(truth.offsets[:-1], truth.offsets[1:], strict=True):
         apart = np.linalg.norm(centre[low:high, None] - centre[low:high], axis=2) - reach[low:high, None]

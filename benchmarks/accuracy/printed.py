@@ -30,16 +30,16 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "printing"))
 import readers
 
-from kpbench.geometry.coverage import coverage
+from kpbench.geometry.coverage import rasterise
 from kpbench.geometry.outline import Line, flatten, move
 from kpbench.patches.board import grid_board, hexagon_board
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.printing.dxf import dxf
+from kpbench.printing.dxf import to_dxf
 from kpbench.printing.page import Page, Shape
-from kpbench.printing.pdf import pdf
-from kpbench.printing.png import png, px_per_mm
-from kpbench.printing.sheet import Paper, Sheet, board_sheet, patch_sheet
-from kpbench.printing.svg import svg
+from kpbench.printing.pdf import to_pdf
+from kpbench.printing.png import px_per_mm, to_png
+from kpbench.printing.sheet import PageFormat, Sheet, board_sheet, patch_sheet
+from kpbench.printing.svg import to_svg
 from kpbench.types import Float
 
 Image.MAX_IMAGE_PIXELS = None
@@ -59,7 +59,7 @@ Picture = tuple[Any, tuple[float, float]]
 
 def own_png(folder: Path, sheet: Sheet, dpi: float) -> Picture:
     scale = px_per_mm(dpi)
-    return grey(Image.open(io.BytesIO(png(sheet.pages[0], dpi)))), (scale, scale)
+    return grey(Image.open(io.BytesIO(to_png(sheet.pages[0], dpi)))), (scale, scale)
 
 
 def pdftoppm(folder: Path, sheet: Sheet, dpi: float) -> Picture:
@@ -116,7 +116,7 @@ def fitted(picture: Any, scale: tuple[float, float], patch: Patch, k: dict[str, 
     x0, y0 = np.floor(centre - reach).astype(int)
     x1, y1 = np.ceil(centre + reach).astype(int) + 1
     polygons = [polygon * px - 0.5 for polygon in flatten(region, 1e-3 / px.max())]
-    ink = coverage([polygons], [(x0, y0, x1 - x0, y1 - y0)])[0]
+    ink = rasterise([polygons], [(x0, y0, x1 - x0, y1 - y0)])[0]
     gy, gx = np.gradient(ink)
     rows, columns = np.nonzero((gx != 0) | (gy != 0))
     gx, gy, ink = (part[rows, columns] for part in (gx, gy, ink))
@@ -131,7 +131,7 @@ def vectors(sheet: Sheet, folder: Path, known: dict[int, Patch]) -> dict[str, fl
     keypoints = sheet.sidecar["keypoints"]
     expected = [readers.ink_centroid_on_page(known[k["patch_id"]], k) for k in keypoints]
     page = sheet.pages[0]
-    contours, _ = readers.dxf_shapes(dxf(page), folder / "a.dxf")
+    contours, _ = readers.dxf_shapes(to_dxf(page), folder / "a.dxf")
     counts = [len(s.region) for s in page.shapes if s.layer == "INK"]
     starts = np.cumsum([0, *counts])
     printed = [s for s in page.shapes if s.layer != "CUT"]
@@ -180,7 +180,7 @@ def main() -> None:
     parser.add_argument("--dpi", type=int, default=300)
     parser.add_argument("--only", help="one sheet, by the beginning of its name")
     options = parser.parse_args()
-    patches, paper = shipped_patches(), Paper(210, 297)
+    patches, paper = shipped_patches(), PageFormat(210, 297)
     known = {p.patch_id: p for p in patches}
     sheets = [patch_sheet(patches, 30, paper), board_sheet(grid_board(patches, 4, 3, 30, 60), paper)]
     sheets += [board_sheet(hexagon_board(p, 187.5), paper) for p in patches]
@@ -190,8 +190,8 @@ def main() -> None:
             continue
         with TemporaryDirectory() as name:
             folder = Path(name)
-            (folder / "a.pdf").write_bytes(pdf(sheet.pages))
-            (folder / "a.svg").write_bytes(svg(sheet.pages[0]))
+            (folder / "a.pdf").write_bytes(to_pdf(sheet.pages))
+            (folder / "a.svg").write_bytes(to_svg(sheet.pages[0]))
             for kind, worst in vectors(sheet, folder, known).items():
                 print(f"{sheet.name:<18} {kind:<14} {'':>7} {worst:>8.4f}", flush=True)
             for reader, render in available().items():
@@ -204,8 +204,8 @@ def main() -> None:
     print(f"\n{'program':<18} {'places in x':>11} {'in y':>5} {'worst edge px':>14}")
     with TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "a.pdf").write_bytes(pdf(sheet.pages))
-        (folder / "a.svg").write_bytes(svg(sheet.pages[0]))
+        (folder / "a.pdf").write_bytes(to_pdf(sheet.pages))
+        (folder / "a.svg").write_bytes(to_svg(sheet.pages[0]))
         for reader, render in available().items():
             errors, (across, down) = places(render(folder, sheet, dpi)[0])
             print(f"{reader:<18} {across:>11} {down:>5} {np.abs(errors).max():>14.3f}", flush=True)

@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.coverage import bounding_box, rasterise
 from kpbench.geometry.outline import arc_vertices
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -156,9 +156,9 @@ def images(
     out = []
     for pose in poses:
         placed = [p @ pose[:, :2].T + pose[:, 2] for p in polygons]
-        boxes = [box_around([p]) for p in placed]
+        boxes = [bounding_box([p]) for p in placed]
         covered = np.zeros((len(polygons), 2 * wide + 1, 2 * wide + 1), np.float32)
-        for window, part, (x, y, w, h) in zip(covered, coverage([[p] for p in placed], boxes), boxes, strict=True):
+        for window, part, (x, y, w, h) in zip(covered, rasterise([[p] for p in placed], boxes), boxes, strict=True):
             left, top = max(-wide, x), max(-wide, y)
             right, bottom = min(wide + 1, x + w), min(wide + 1, y + h)
             if left < right and top < bottom:

@@ -30,7 +30,7 @@ from kpbench.analysis.cell_images import (
     window_weights,
 )
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
-from kpbench.geometry.homography import projected_disc
+from kpbench.geometry.homography import project_disc
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, UInt8
 
@@ -168,7 +168,7 @@ def tilt_bias(patch: Patch, radius_px: float = 45.0, tilt_deg: float = 60.0) -> 
     pose = plane_to_camera(rotation_xyz(0.0, tilt_deg, 0.0), [0.0, 0.0, camera.focal_px / radius_px])
     H = camera.K @ pose
     keypoint = H[:2, 2] / H[2, 2]
-    disc = projected_disc(H)
+    disc = project_disc(H)
     return float(np.hypot(disc.x - keypoint[0], disc.y - keypoint[1]))
 
 

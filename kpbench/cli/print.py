@@ -96,7 +96,7 @@ def render_patches(
     from kpbench.errors import DesignError
     from kpbench.patches.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.printing.sheet import board_sheet, file_stem, parse_paper, patch_sheet, save_sheet
+    from kpbench.printing.sheet import board_sheet, file_stem, parse_page_format, patch_sheet, save_sheet
     from kpbench.printing.sidecar import correct_sidecars
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
@@ -113,7 +113,7 @@ def render_patches(
     if board not in (None, "hexagon", "grid") and chosen:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")
 
-    paper = parse_paper(page, landscape, labels=not no_labels, mirrored=mirror)
+    paper = parse_page_format(page, landscape, labels=not no_labels, mirrored=mirror)
     diameter = 30.0 if diameter_mm is None else diameter_mm
     own = load_patches(designs) if designs else None
     patches = shipped_patches() if own is None else own

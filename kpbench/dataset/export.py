@@ -60,7 +60,7 @@ def export_dataset(dataset: Dataset, form: str, out: str | Path, progress: Progr
 def _boxes(keypoints: NDArray[Any], width: int, height: int) -> NDArray[np.float64]:
     """Boxes around the projected discs, cut at the image, px from the corner: (n, 4) of x, y, w, h."""
     H = keypoints["H_patch2image"]
-    dual = H @ np.diag([1.0, 1.0, -1.0]) @ H.transpose(0, 2, 1)  # see geometry.projected_disc
+    dual = H @ np.diag([1.0, 1.0, -1.0]) @ H.transpose(0, 2, 1)  # see geometry.project_disc
     dual = dual / dual[:, 2:, 2:]
     centre = dual[:, :2, 2]
     half = np.sqrt(centre**2 - dual[:, (0, 1), (0, 1)])

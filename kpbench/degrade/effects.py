@@ -15,7 +15,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from kpbench.geometry.coverage import Box, box_around, coverage, inside_image
+from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
 from kpbench.geometry.outline import arc_vertices
 from kpbench.images import encode_jpeg
 from kpbench.types import Float, UInt8
@@ -87,7 +87,7 @@ def line_kernel(length_px: float, angle_deg: float) -> Float:
     corners = np.array([[half, side], [-half, side], [-half, -side], [half, -side]])
     reach = int(np.ceil(half + 1)) + 1
     box = (-reach, -reach, 2 * reach + 1, 2 * reach + 1)
-    kernel = coverage([[corners @ np.array([[c, s], [-s, c]])]], [box])[0]
+    kernel = rasterise([[corners @ np.array([[c, s], [-s, c]])]], [box])[0]
     kernel = kernel + kernel[::-1, ::-1]  # point-symmetric to the last bit
     kernel[kernel < 1e-9] = 0.0  # what a running sum leaves behind; OpenCV passes over zeros
     border = int((kernel.any(axis=0) | kernel.any(axis=1)).argmax())
@@ -107,7 +107,7 @@ def disc_kernel(radius_px: float) -> Float:
     step = 2 * np.pi / 256
     rim = arc_vertices(radius_px, np.arange(256) * step, step)
     reach = int(np.ceil(radius_px)) + 1
-    kernel = coverage([[rim]], [(-reach, -reach, 2 * reach + 1, 2 * reach + 1)])[0]
+    kernel = rasterise([[rim]], [(-reach, -reach, 2 * reach + 1, 2 * reach + 1)])[0]
     kernel = kernel + kernel[::-1, ::-1]
     return np.asarray(kernel / kernel.sum())
 
@@ -217,11 +217,11 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
     """Lay opaque strips over the image: [x, y (of the middle), length, width in px, angle_deg, grey] each."""
     result = image.copy()
     for polygon, strip in zip(_strips(strips), strips, strict=True):
-        x, y, w, h = box_around([polygon])
+        x, y, w, h = bounding_box([polygon])
         x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
         if x1 <= x0 or y1 <= y0:
             continue
-        cover = _across(coverage([[polygon]], [(x, y, w, h)])[0][y0 - y : y1 - y, x0 - x : x1 - x], image)
+        cover = _across(rasterise([[polygon]], [(x, y, w, h)])[0][y0 - y : y1 - y, x0 - x : x1 - x], image)
         part = result[y0:y1, x0:x1]
         result[y0:y1, x0:x1] = _uint8(part + (strip[5] - part) * cover)
     return result
@@ -247,9 +247,9 @@ def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
     x, y, w, h = box
     seen = np.ones((h, w))
     for polygon in _strips(strips):
-        around = box_around([polygon])
+        around = bounding_box([polygon])
         shifted = (around[0] - x, around[1] - y, *around[2:])
-        there, here = inside_image(shifted, seen)
+        there, here = clip_to_image(shifted, seen)
         if seen[there].size:
-            seen[there] *= 1 - coverage([[polygon]], [around])[0][here]
+            seen[there] *= 1 - rasterise([[polygon]], [around])[0][here]
     return 1 - seen

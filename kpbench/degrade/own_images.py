@@ -11,12 +11,12 @@ import numpy as np
 from kpbench.degrade.ladder import apply, climb
 from kpbench.errors import DataError
 from kpbench.files import make_folder, write_atomic
-from kpbench.images import Source, encode_png
+from kpbench.images import ImageSource, encode_png
 from kpbench.seeds import stream
 
 
 def degrade_files(
-    source: Source, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
+    source: ImageSource, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
 ) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
     """Degrade images one by one and write them as PNG under their own names, with the folders they are in.
 

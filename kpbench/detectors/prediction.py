@@ -16,7 +16,7 @@ from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, load_detector, one_line
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
-from kpbench.images import Source, image_writer
+from kpbench.images import ImageSource, image_writer
 from kpbench.types import Detections, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
@@ -79,7 +79,7 @@ def predict(
 
 
 def predict_images(
-    source: Source,
+    source: ImageSource,
     detector: str | LoadedDetector,
     *,
     threshold: float | None = None,

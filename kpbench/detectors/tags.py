@@ -12,7 +12,7 @@ import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.images import to_grey
-from kpbench.patches.tag_boards import charuco_pattern, dictionary
+from kpbench.patches.tag_boards import charuco_pattern, tag_dictionary
 from kpbench.types import Detections, UInt8
 
 
@@ -29,7 +29,7 @@ class ArucoDetector:
     def __init__(self) -> None:
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-        self._detector = cv2.aruco.ArucoDetector(dictionary("aruco"), parameters)
+        self._detector = cv2.aruco.ArucoDetector(tag_dictionary("aruco"), parameters)
 
     def detect(self, image: UInt8) -> Detections:
         """Corners of all tags in one image, uint8 (H, W) or RGB (H, W, 3); each has the score 1."""

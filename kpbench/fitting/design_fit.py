@@ -14,7 +14,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from kpbench.geometry.coverage import Box, coverage
+from kpbench.geometry.coverage import Box, rasterise
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
@@ -61,7 +61,7 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
         for step in range(steps):
             live = [n for n, state in enumerate(states) if state.moved > SETTLED]
             boxes = [_box(states[n], patches[n].extent) for n in live]
-            covers = coverage([_outline(states[n], patches[n]) for n in live], boxes)
+            covers = rasterise([_outline(states[n], patches[n]) for n in live], boxes)
             for n, box, cover in zip(live, boxes, covers, strict=True):
                 last = largest_px > 30 and step == steps - 1
                 states[n] = _step(states[n], levels[level[n]], box, cover, patches[n].extent, last)

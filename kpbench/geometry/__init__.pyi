@@ -1,6 +1,6 @@
 from .camera import Camera as Camera
-from .coverage import coverage as coverage
+from .coverage import rasterise as rasterise
 from .homography import project as project
-from .homography import projected_discs as projected_discs
+from .homography import project_discs as project_discs
 
 __all__: list[str]

@@ -21,14 +21,14 @@ Box = tuple[int, int, int, int]
 """Columns and rows of a pixel rectangle: (x, y, width, height); may reach outside the image."""
 
 
-def box_around(polygons: Sequence[Float]) -> Box:
-    """The smallest box that :func:`coverage` accepts for these polygons (a one-pixel margin)."""
+def bounding_box(polygons: Sequence[Float]) -> Box:
+    """The smallest box that :func:`rasterise` accepts for these polygons (a one-pixel margin)."""
     x, y = np.concatenate(list(polygons)).T
     left, top = math.floor(x.min() + 0.5) - 1, math.floor(y.min() + 0.5) - 1
     return left, top, math.floor(x.max() + 0.5) + 2 - left, math.floor(y.max() + 0.5) + 2 - top
 
 
-def coverage(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[Float]:
+def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[Float]:
     """Rasterise several regions, each into a box of its own.
 
     Parameters
@@ -37,7 +37,7 @@ def coverage(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[F
         Polygons in px (pixel centres at integers). Within one region, holes run the other way round
         than outer borders; which way round the outer borders run does not matter.
     boxes : sequence of Box
-        One a region, at least :func:`box_around` of it.
+        One a region, at least :func:`bounding_box` of it.
 
     Returns
     -------
@@ -49,11 +49,11 @@ def coverage(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[F
     if not len(owner):
         return [np.zeros((h, w)) for _, _, w, h in boxes]
     ends = [np.concatenate([polygon[1:], polygon[:1]]) for polygon in polygons]  # a fifth of np.roll's time
-    return edge_coverage(np.concatenate(polygons).T, np.concatenate(ends).T, owner, boxes)
+    return rasterise_edges(np.concatenate(polygons).T, np.concatenate(ends).T, owner, boxes)
 
 
-def edge_coverage(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
-    """:func:`coverage` of regions given by their edges.
+def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
+    """:func:`rasterise` of regions given by their edges.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
     return np.asarray(np.bincount(np.concatenate([index, index + 1]), weights, total + 1)[:total], np.float64)
 
 
-def inside_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
+def clip_to_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
     """Slices of the image and of the box for the part of a box that lies in the image."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])

@@ -48,7 +48,7 @@ class Ellipse:
     angle_deg: float
 
 
-def projected_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
+def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     """Images of the unit circle under many homographies.
 
     The dual conic of the unit circle is diag(1, 1, -1); under H it becomes H C* Hᵀ (Hartley and
@@ -77,15 +77,15 @@ def projected_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     return dual[:, :2, 2], major, minor, angle_deg
 
 
-def projected_disc(H_patch2image: Float) -> Ellipse:
-    """Image of the unit circle under one homography, see :func:`projected_discs`.
+def project_disc(H_patch2image: Float) -> Ellipse:
+    """Image of the unit circle under one homography, see :func:`project_discs`.
 
     Raises
     ------
     ValueError
         If the disc touches or crosses the camera's horizon, so that its image is no ellipse.
     """
-    centre, major, minor, angle_deg = projected_discs(H_patch2image[None])
+    centre, major, minor, angle_deg = project_discs(H_patch2image[None])
     if np.isnan(major[0]):
         raise ValueError("the disc reaches the horizon of the camera: its image is not an ellipse")
     return Ellipse(float(centre[0, 0]), float(centre[0, 1]), float(major[0]), float(minor[0]), float(angle_deg[0]))

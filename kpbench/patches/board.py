@@ -33,7 +33,7 @@ SIZE_MM = (0.1, 5000.0)  # least and most that a board's file may ask for, of di
 PLACE_MM = (-25_000.0, 25_000.0)  # likewise, of coordinates
 
 
-class CameraKeypoint(Protocol):
+class BoardPoint(Protocol):
     """A point on a board and the disc that is its measure, which a patch fills."""
 
     @property
@@ -47,7 +47,7 @@ class CameraKeypoint(Protocol):
         ...
 
 
-class CameraBoard(Protocol):
+class BoardLike(Protocol):
     """What :mod:`kpbench.render` needs of a board: a :class:`Board`, or a :class:`kpbench.patches.TagBoard`."""
 
     @property
@@ -61,7 +61,7 @@ class CameraBoard(Protocol):
         ...
 
     @property
-    def keypoints(self) -> Sequence[CameraKeypoint]:
+    def keypoints(self) -> Sequence[BoardPoint]:
         """In the order of their truth."""
         ...
 

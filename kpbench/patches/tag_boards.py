@@ -24,13 +24,13 @@ DICTIONARIES = {
     "apriltag": cv2.aruco.DICT_APRILTAG_36h11,
     "charuco": cv2.aruco.DICT_4X4_50,
 }
-TAGS = 2  # on a diagonal: eight corners, and four tags would be no smaller
+TAGS_PER_BOARD = 2  # on a diagonal: eight corners, and four tags would be no smaller
 CHARUCO_SQUARES = (4, 3)  # six corners inside
-SQUARE, MARKER = 8, 6  # modules of a ChArUco square and of the marker in it
+SQUARE_MODULES, MARKER_MODULES = 8, 6  # modules of a ChArUco square and of the marker in it
 
 
 @dataclass(frozen=True)
-class Corner:
+class TagCorner:
     """A keypoint of a tag board, mm; the circle about it is what a patch's disc is: the measure of ε."""
 
     patch_id: int
@@ -53,7 +53,7 @@ class TagBoard:
     ----------
     name : str
     side_x_mm, side_y_mm : float
-    keypoints : tuple of Corner
+    keypoints : tuple of TagCorner
     black : ndarray of shape (n, n), bool
         The modules of the whole board, row by row.
     """
@@ -61,7 +61,7 @@ class TagBoard:
     name: str
     side_x_mm: float
     side_y_mm: float
-    keypoints: tuple[Corner, ...]
+    keypoints: tuple[TagCorner, ...]
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
@@ -85,14 +85,14 @@ class TagBoard:
         }
 
 
-def dictionary(board: str) -> cv2.aruco.Dictionary:
+def tag_dictionary(board: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a board's tags."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARIES[board])
 
 
 def charuco_pattern() -> cv2.aruco.CharucoBoard:
     """The ChArUco pattern in OpenCV's own words, lengths in modules."""
-    return cv2.aruco.CharucoBoard(CHARUCO_SQUARES, SQUARE, MARKER, dictionary("charuco"))
+    return cv2.aruco.CharucoBoard(CHARUCO_SQUARES, SQUARE_MODULES, MARKER_MODULES, tag_dictionary("charuco"))
 
 
 @lru_cache
@@ -106,7 +106,7 @@ def tag_board(name: str, side_mm: float) -> TagBoard:
     module_mm = side_mm / len(black)
     at_mm = (np.array(list(corners.values())) - len(black) / 2) * module_mm
     keypoints = tuple(
-        Corner(n, float(x), float(y), HEXAGON_DIAMETER * side_mm) for n, (x, y) in zip(corners, at_mm, strict=True)
+        TagCorner(n, float(x), float(y), HEXAGON_DIAMETER * side_mm) for n, (x, y) in zip(corners, at_mm, strict=True)
     )
     return TagBoard(name, side_mm, side_mm, keypoints, black)
 
@@ -116,11 +116,11 @@ Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
 
 
 def _two_tags(name: str) -> Modules:
-    tags = dictionary(name)
+    tags = tag_dictionary(name)
     width = tags.markerSize + 2
-    black = np.zeros((TAGS * (width + 1) + 1,) * 2, bool)
+    black = np.zeros((TAGS_PER_BOARD * (width + 1) + 1,) * 2, bool)
     corners = {}
-    for tag in range(TAGS):
+    for tag in range(TAGS_PER_BOARD):
         first = 1 + tag * (width + 1)
         black[first : first + width, first : first + width] = tags.generateImageMarker(tag, width) == 0
         for corner, (x, y) in enumerate([(0, 0), (width, 0), (width, width), (0, width)]):
@@ -130,7 +130,7 @@ def _two_tags(name: str) -> Modules:
 
 def _charuco() -> Modules:
     pattern = charuco_pattern()
-    columns, rows = (SQUARE * squares for squares in CHARUCO_SQUARES)
+    columns, rows = (SQUARE_MODULES * squares for squares in CHARUCO_SQUARES)
     black = np.zeros((columns + 2,) * 2, bool)
     top = (len(black) - rows) // 2
     black[top : top + rows, 1 : columns + 1] = pattern.generateImage((columns, rows)) == 0

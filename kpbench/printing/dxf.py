@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from kpbench.geometry.outline import Arc, Contour
-from kpbench.printing.page import CUT, LAYERS, Page, cut_arc, start_of
+from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
 
 
-def dxf(page: Page) -> bytes:
+def to_dxf(page: Page) -> bytes:
     """The page as ASCII DXF of AutoCAD 2000, in mm, arcs exact as bulges of closed polylines.
 
     The frame is DXF's: **y up**, the origin is the page's bottom-left corner, so y is ``height - y`` of
@@ -44,10 +44,10 @@ def _dxf_text(text: str) -> str:
 
 def _dxf_vertices(contour: Contour, height: float) -> list[tuple[int, Any]]:
     """Vertices with bulge = tan(sweep / 4); y up makes a positive sweep run clockwise, which is negative."""
-    parts = [piece for part in contour for piece in cut_arc(part, 180.0)]
+    parts = [piece for part in contour for piece in split_arc(part, 180.0)]
     tags: list[tuple[int, Any]] = [(90, len(parts)), (70, 1), (43, 0.0)]
     for part in parts:
-        x, y = start_of(part)
+        x, y = start_point(part)
         tags += [(10, float(x)), (20, float(height - y))]
         if isinstance(part, Arc):
             tags.append((42, -math.tan(math.radians(part.sweep_deg) / 4)))

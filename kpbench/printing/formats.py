@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from kpbench.printing.dxf import dxf
+from kpbench.printing.dxf import to_dxf
 from kpbench.printing.page import Page
-from kpbench.printing.pdf import pdf
-from kpbench.printing.png import png
-from kpbench.printing.svg import svg
+from kpbench.printing.pdf import to_pdf
+from kpbench.printing.png import to_png
+from kpbench.printing.svg import to_svg
 
 WRITERS: dict[str, Callable[[Sequence[Page], float], list[bytes]]] = {
-    ".svg": lambda pages, dpi: [svg(page) for page in pages],
-    ".png": lambda pages, dpi: [png(page, dpi) for page in pages],
-    ".pdf": lambda pages, dpi: [pdf(pages)],
-    ".dxf": lambda pages, dpi: [dxf(page) for page in pages],
+    ".svg": lambda pages, dpi: [to_svg(page) for page in pages],
+    ".png": lambda pages, dpi: [to_png(page, dpi) for page in pages],
+    ".pdf": lambda pages, dpi: [to_pdf(pages)],
+    ".dxf": lambda pages, dpi: [to_dxf(page) for page in pages],
 }
 """Suffix to (pages, dpi) -> the contents of the files: one for PDF, one a page for the others."""

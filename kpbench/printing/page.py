@@ -72,12 +72,12 @@ def mirror(page: Page) -> Page:
     return Page(width, page.height, shapes, texts, page.title)
 
 
-def start_of(part: Line | Arc) -> tuple[float, float]:
+def start_point(part: Line | Arc) -> tuple[float, float]:
     """Return where a segment begins, in mm."""
     return (part.x0, part.y0) if isinstance(part, Line) else part.point(0.0)
 
 
-def cut_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
+def split_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
     """The segment itself, or its arc cut into equal arcs of at most ``max_deg``."""
     if isinstance(part, Line):
         return (part,)
@@ -86,6 +86,6 @@ def cut_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
     return (Arc(part.x, part.y, part.radius, part.start_deg + n * step, step) for n in range(count))
 
 
-def cut_contours(region: Region, max_deg: float) -> list[list[Line | Arc]]:
+def split_arcs(region: Region, max_deg: float) -> list[list[Line | Arc]]:
     """Return the contours of a region with each arc cut into equal arcs of at most ``max_deg``."""
-    return [[piece for part in contour for piece in cut_arc(part, max_deg)] for contour in region]
+    return [[piece for part in contour for piece in split_arc(part, max_deg)] for contour in region]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from kpbench.geometry.outline import Line, Region
-from kpbench.printing.page import CUT, Page, cut_contours, start_of
+from kpbench.printing.page import CUT, Page, split_arcs, start_point
 
 PDF_FONT = "Vera"  # comes with reportlab, may be embedded freely
 
@@ -16,7 +16,7 @@ PDF_FONT = "Vera"  # comes with reportlab, may be embedded freely
 PT_PER_MM = 72 / 25.4
 
 
-def pdf(pages: Sequence[Page]) -> bytes:
+def to_pdf(pages: Sequence[Page]) -> bytes:
     """All pages as one PDF: filled paths only, text in an embedded font, and a request to the viewer not to scale.
 
     An arc becomes cubic Béziers of at most 22.5 degrees, with control points at ``4/3 tan(sweep/4)``
@@ -60,16 +60,16 @@ def _pdf_path(path: Any, region: Region, height_pt: float) -> Any:
     def pt(x: float, y: float) -> tuple[float, float]:
         return x * PT_PER_MM, height_pt - y * PT_PER_MM
 
-    for contour in cut_contours(region, 22.5):
-        path.moveTo(*pt(*start_of(contour[0])))
+    for contour in split_arcs(region, 22.5):
+        path.moveTo(*pt(*start_point(contour[0])))
         for part, after in zip(contour, contour[1:] + contour[:1], strict=True):
             if isinstance(part, Line):
-                path.lineTo(*pt(*start_of(after)))
+                path.lineTo(*pt(*start_point(after)))
                 continue
             (x0, y0), (x1, y1) = part.point(0.0), part.point(1.0)
             k = 4 / 3 * math.tan(math.radians(part.sweep_deg) / 4)
             first = (x0 - k * (y0 - part.y), y0 + k * (x0 - part.x))
             second = (x1 + k * (y1 - part.y), y1 - k * (x1 - part.x))
-            path.curveTo(*pt(*first), *pt(*second), *pt(*start_of(after)))
+            path.curveTo(*pt(*first), *pt(*second), *pt(*start_point(after)))
         path.close()
     return path

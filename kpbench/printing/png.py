@@ -20,7 +20,7 @@ def px_per_mm(dpi: float) -> float:
     return round(dpi / 0.0254) / 1000
 
 
-def png(page: Page, dpi: float) -> bytes:
+def to_png(page: Page, dpi: float) -> bytes:
     """The page as 8-bit grey PNG, every pixel grey by the exact area that ink covers.
 
     The page's top-left corner is the corner of the first pixel, hence a point (x, y) in mm lies at
@@ -33,7 +33,7 @@ def png(page: Page, dpi: float) -> bytes:
     """
     from PIL import Image
 
-    from kpbench.geometry.coverage import box_around, coverage
+    from kpbench.geometry.coverage import bounding_box, rasterise
 
     scale = px_per_mm(dpi)
     width, height = round(page.width * scale), round(page.height * scale)
@@ -53,8 +53,8 @@ def png(page: Page, dpi: float) -> bytes:
     for shape in page.shapes:
         if shape.layer != CUT:
             polygons = [polygon * scale - 0.5 for polygon in flatten(shape.region, 1e-3 / scale)]
-            box = box_around(polygons)
-            ink(box[0], box[1], coverage([polygons], [box])[0])
+            box = bounding_box(polygons)
+            ink(box[0], box[1], rasterise([polygons], [box])[0])
     for text in page.texts:
         letters, left, top = _letters(text, scale)
         ink(round(text.x * scale + left), round(text.y * scale + top), letters)

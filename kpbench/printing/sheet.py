@@ -26,9 +26,9 @@ from kpbench.printing.formats import WRITERS
 from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror
 from kpbench.printing.png import px_per_mm
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, nm
-from kpbench.printing.tiling import Tile, tiles_of
+from kpbench.printing.tiling import Tile, cut_into_tiles
 
-PAPERS = {  # mm; ISO 216 and ANSI Y14.1
+PAGE_SIZES_MM = {  # mm; ISO 216 and ANSI Y14.1
     "a4": (210.0, 297.0),
     "a3": (297.0, 420.0),
     "a2": (420.0, 594.0),
@@ -47,7 +47,7 @@ CROSS_ARM = 2.5
 
 
 @dataclass(frozen=True)
-class Paper:
+class PageFormat:
     """A page to print on: sizes in mm, whether text is printed, and whether left and right are swapped."""
 
     width: float
@@ -85,7 +85,7 @@ class Sheet:
     sidecar: Mapping[str, Any]
 
 
-def parse_paper(text: str, landscape: bool = False, labels: bool = True, mirrored: bool = False) -> Paper:
+def parse_page_format(text: str, landscape: bool = False, labels: bool = True, mirrored: bool = False) -> PageFormat:
     """The paper called ``a4``, ``letter``, … or ``WxHmm``.
 
     Raises
@@ -94,15 +94,15 @@ def parse_paper(text: str, landscape: bool = False, labels: bool = True, mirrore
         If it is neither, or a side is not from 40 to 5000 mm.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)(?:mm)?", text.lower())
-    if text.lower() not in PAPERS and not match:
-        raise DesignError(f"page {text!r} is not known, expected {', '.join(PAPERS)} or WIDTHxHEIGHTmm")
-    width, height = (float(match[1]), float(match[2])) if match else PAPERS[text.lower()]
+    if text.lower() not in PAGE_SIZES_MM and not match:
+        raise DesignError(f"page {text!r} is not known, expected {', '.join(PAGE_SIZES_MM)} or WIDTHxHEIGHTmm")
+    width, height = (float(match[1]), float(match[2])) if match else PAGE_SIZES_MM[text.lower()]
     if not (40 <= width <= 5000 and 40 <= height <= 5000):
         raise DesignError(f"page {text!r} is {width:g} x {height:g} mm, expected 40 to 5000 mm a side")
-    return Paper(*((height, width) if landscape else (width, height)), labels, mirrored)
+    return PageFormat(*((height, width) if landscape else (width, height)), labels, mirrored)
 
 
-def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: Paper, copies: int = 1) -> Sheet:
+def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: PageFormat, copies: int = 1) -> Sheet:
     """Patches to be cut out, ``copies`` of each, on as many pages as it takes.
 
     Parameters
@@ -110,7 +110,7 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: Paper, copi
     patches : sequence of Patch
     diameter_mm : float
         Of the unit disc; rims and quiet zones come on top.
-    paper : Paper
+    paper : PageFormat
     copies : int
 
     Raises
@@ -152,7 +152,7 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, paper: Paper, copi
     return Sheet("patches", tuple(pages), sidecar)
 
 
-def board_sheet(board: Board, paper: Paper, tile: bool = False) -> Sheet:
+def board_sheet(board: Board, paper: PageFormat, tile: bool = False) -> Sheet:
     """A board in the middle of one page, or with ``tile`` on as many pages as it takes.
 
     Tiles are cut along straight seams that pass between patches. Crosses mark the corners of every
@@ -174,7 +174,7 @@ def board_sheet(board: Board, paper: Paper, tile: bool = False) -> Sheet:
             f"board made smaller with it, is {_floored(scale * max(k.diameter_mm for k in board.keypoints))} mm; "
             "--tile spreads the board over pages"
         )
-    tiles = tiles_of(board, room_x, room_y)
+    tiles = cut_into_tiles(board, room_x, room_y)
     keypoints = []
     for index, k in enumerate(board.keypoints):
         page = next(n for n, t in enumerate(tiles) if t.holds(k.x_mm, k.y_mm))
@@ -248,7 +248,7 @@ def file_stem(name: str) -> str:
 # --- parts of a page, before any mirroring ----------------------------------------------------------
 
 
-def _frame(paper: Paper, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
+def _frame(paper: PageFormat, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
     """Both rulers, the line of text on top, and the one at the bottom right."""
     (ruler_x, ruler_y), width, height = paper.rulers, paper.width, paper.height
     inner, below = BLANK + STRIP, height - BLANK - STRIP
@@ -284,7 +284,7 @@ def _comb(length: float) -> list[tuple[float, float]]:
     return points
 
 
-def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], paper: Paper) -> Page:
+def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], paper: PageFormat) -> Page:
     sizes = sorted({f"{k.diameter_mm:g}": k.diameter_mm for k in board.keypoints}.items(), key=lambda item: item[1])
     title = f"kpbench board {board.name}, {board.side_x_mm:.6g} x {board.side_y_mm:.6g} mm, disc diameter "
     title += " to ".join(dict.fromkeys((sizes[0][0], sizes[-1][0]))) + " mm"
@@ -309,7 +309,7 @@ def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], paper: Paper) ->
     return paper.page(shapes, texts, title)
 
 
-def _on_page(tile: Tile, paper: Paper, x: float, y: float) -> tuple[float, float]:
+def _on_page(tile: Tile, paper: PageFormat, x: float, y: float) -> tuple[float, float]:
     """A point of the board on the tile's page: the tile's window sits in the page's middle."""
     return x + (paper.width - tile.x0 - tile.x1) / 2, y + (paper.height - tile.y0 - tile.y1) / 2
 
@@ -359,7 +359,7 @@ def _floored(diameter: float) -> str:
 # --- parts of a sidecar ------------------------------------------------------------------------------
 
 
-def _sidecar_head(schema: str, name: str, digest: str, paper: Paper, patches: Iterable[Patch]) -> dict[str, Any]:
+def _sidecar_head(schema: str, name: str, digest: str, paper: PageFormat, patches: Iterable[Patch]) -> dict[str, Any]:
     return {
         "schema": schema,
         "kpbench": __version__,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from xml.sax.saxutils import escape
 
 from kpbench.geometry.outline import Line, Region
-from kpbench.printing.page import INK, MARKS, Page, Text, cut_contours, start_of
+from kpbench.printing.page import INK, MARKS, Page, Text, split_arcs, start_point
 
 SVG_FONTS = "Helvetica, Arial, sans-serif"
 
@@ -18,10 +18,10 @@ def _mm(*values: float) -> str:
 def _svg_path(region: Region) -> str:
     """Path data. Arcs are at most 90 degrees: in longer ones the rounding of the ends moves the centre."""
     data = []
-    for contour in cut_contours(region, 90.0):
-        data.append("M" + _mm(*start_of(contour[0])))
+    for contour in split_arcs(region, 90.0):
+        data.append("M" + _mm(*start_point(contour[0])))
         for part, after in zip(contour, contour[1:] + contour[:1], strict=True):
-            end = _mm(*start_of(after))
+            end = _mm(*start_point(after))
             if isinstance(part, Line):
                 data.append(f"L{end}")
             else:
@@ -30,7 +30,7 @@ def _svg_path(region: Region) -> str:
     return "".join(data)
 
 
-def svg(page: Page) -> bytes:
+def to_svg(page: Page) -> bytes:
     """The page as SVG, in mm, with true arcs."""
     size = f'width="{_mm(page.width)}mm" height="{_mm(page.height)}mm" viewBox="0 0 {_mm(page.width, page.height)}"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']

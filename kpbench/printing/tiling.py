@@ -32,7 +32,7 @@ class Tile:
         return self.x0 <= x_mm < self.x1 and self.y0 <= y_mm < self.y1
 
 
-def tiles_of(board: Board, room_x_mm: float, room_y_mm: float) -> list[Tile]:
+def cut_into_tiles(board: Board, room_x_mm: float, room_y_mm: float) -> list[Tile]:
     """As few tiles of at most the given size as hold the board, row by row; one if it fits.
 
     Raises

@@ -17,10 +17,10 @@ from scipy.optimize import brentq
 
 from kpbench.errors import DataError
 from kpbench.geometry.camera import NO_DISTORTION, Camera, plane_to_camera, rotation_xyz
-from kpbench.geometry.coverage import Box, box_around, coverage, inside_image
-from kpbench.geometry.homography import Ellipse, projected_disc
+from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
+from kpbench.geometry.homography import Ellipse, project_disc
 from kpbench.geometry.outline import flatten, rectangle
-from kpbench.patches.board import CameraBoard
+from kpbench.patches.board import BoardLike
 from kpbench.render.scene import Mask, Rendered, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
@@ -80,7 +80,7 @@ def to_px(camera: Camera, pose: Pose, points_mm: Float) -> Float:
     return camera.project(np.column_stack([points_mm, np.ones(len(points_mm))]) @ pose.M_board2camera.T)
 
 
-def outline_px(camera: Camera, pose: Pose, board: CameraBoard, inset: float = 0.0) -> Float:
+def outline_px(camera: Camera, pose: Pose, board: BoardLike, inset: float = 0.0) -> Float:
     """The board's edge in the image, shape (N, 2); ``inset`` in mm moves it inwards."""
     w, h = board.side_x_mm - 2 * inset, board.side_y_mm - 2 * inset
     corners = flatten(rectangle(-w / 2, -h / 2, w, h), 1.0)[0]
@@ -101,7 +101,7 @@ def _bent(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
 
 def pose_board(
     camera: Camera,
-    board: CameraBoard,
+    board: BoardLike,
     area_percent: float,
     *,
     pitch_deg: float = 0.0,
@@ -144,7 +144,7 @@ def pose_board(
     )
 
 
-def _depth(camera: Camera, board: CameraBoard, R: Float, ray: Float, area_px: float) -> float:
+def _depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px: float) -> float:
     """Distance along the optical axis, mm, at which the board's image has an area."""
 
     def solve(lens: Camera, near: float, far: float) -> float:
@@ -165,7 +165,7 @@ def _depth(camera: Camera, board: CameraBoard, R: Float, ray: Float, area_px: fl
         raise DataError(f"no distance gives a board an image of {area_px:.0f} px at this tilt and lens") from None
 
 
-def board_keypoints(camera: Camera, pose: Pose, board: CameraBoard) -> NDArray[Any]:
+def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any]:
     """Truth of every keypoint of a board that lies wholly in the image, a :data:`KEYPOINT_DTYPE` table.
 
     With a distorting lens ``H_patch2image`` is the homography that agrees with the lens at the keypoint to
@@ -179,7 +179,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: CameraBoard) -> NDArray[A
         H = camera.local_K(ray) @ M
         H /= H[2, 2]
         x, y = camera.distort(ray[None])[0]
-        e = _moments_ellipse(_rim(camera, M)) if any(camera.distortion) else projected_disc(H)
+        e = _moments_ellipse(_rim(camera, M)) if any(camera.distortion) else project_disc(H)
         keypoints[n] = (x, y, k.patch_id, e.major, e.minor, e.angle_deg, H, 1.0, np.nan)
     return keypoints
 
@@ -206,7 +206,7 @@ def _moments_ellipse(points: Float) -> Ellipse:
     return Ellipse(float(x), float(y), float(major), float(minor), angle_deg)
 
 
-def render_board(background: UInt8, camera: Camera, pose: Pose, board: CameraBoard, look: Look) -> Rendered:
+def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike, look: Look) -> Rendered:
     """Paint a board before a background with exact area coverage.
 
     Parameters
@@ -226,9 +226,9 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: CameraBoa
         [[_bent(camera, pose, polygon) for polygon in region] for region in regions]
         for regions in board.outlines(keypoints["radius_major"])
     )
-    part_boxes, disc_boxes = [box_around(part) for part in parts], [box_around(disc) for disc in discs]
-    whole = box_around([polygon for region in ([edge], *parts, *discs) for polygon in region])
-    covers = coverage([[edge], [face], *parts, *discs], [whole, whole, *part_boxes, *disc_boxes])
+    part_boxes, disc_boxes = [bounding_box(part) for part in parts], [bounding_box(disc) for disc in discs]
+    whole = bounding_box([polygon for region in ([edge], *parts, *discs) for polygon in region])
+    covers = rasterise([[edge], [face], *parts, *discs], [whole, whole, *part_boxes, *disc_boxes])
     board_cover, face_cover = covers[:2]
     black = np.zeros_like(face_cover)
     for box, cover in zip(part_boxes, covers[2:], strict=False):
@@ -241,7 +241,7 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: CameraBoa
     image, side_px = background.copy(), float(np.sqrt(polygon_area(edge)))
     if look.shadow:
         _cast_shadow(image, edge, side_px, look)
-    there, here = inside_image(whole, image)
+    there, here = clip_to_image(whole, image)
     below = 1.0 - board_cover
     ink = look.white * (look.edge * (board_cover - face_cover) + face_cover) - (look.white - look.black) * black
     ink *= _light(look, whole, to_px(camera, pose, np.zeros((1, 2)))[0], side_px)
@@ -250,7 +250,7 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: CameraBoa
         ink, below = ink[..., None], below[..., None]
     image[there] = np.rint(image[there] * below + ink).astype(np.uint8)
     for n, mask in enumerate(masks):
-        keypoints[n]["visible"] = mask.disc[inside_image(mask.box, image)[1]].sum() / mask.disc.sum()
+        keypoints[n]["visible"] = mask.disc[clip_to_image(mask.box, image)[1]].sum() / mask.disc.sum()
     keypoints["contrast"] = measure_contrast(image, masks)
     return Rendered(image, keypoints, masks)
 
@@ -274,11 +274,11 @@ def _cast_shadow(image: UInt8, edge_px: Float, side_px: float, look: Look) -> No
     step = max(1, round(side_px / SHADOW_GRID))
     soft = SHADOW_SOFT * side_px / step
     moved = (edge_px - SHADOW_REACH * side_px * np.asarray(look.slope) + 0.5) / step - 0.5
-    x, y, w, h = box_around([moved])
+    x, y, w, h = bounding_box([moved])
     grow = int(np.ceil(3 * soft))
     box = (x - grow, y - grow, w + 2 * grow, h + 2 * grow)
-    taken = cv2.GaussianBlur(coverage([[moved]], [box])[0].astype(np.float32), (0, 0), soft)
+    taken = cv2.GaussianBlur(rasterise([[moved]], [box])[0].astype(np.float32), (0, 0), soft)
     fine = cv2.resize(taken, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
-    there, here = inside_image((box[0] * step, box[1] * step, fine.shape[1], fine.shape[0]), image)
+    there, here = clip_to_image((box[0] * step, box[1] * step, fine.shape[1], fine.shape[0]), image)
     kept = 1 - np.float32(look.shadow) * fine[here]
     image[there] = np.rint(image[there] * (kept if image.ndim == 2 else kept[..., None])).astype(np.uint8)

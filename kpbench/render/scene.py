@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.geometry.coverage import Box, box_around, edge_coverage, inside_image
-from kpbench.geometry.homography import projected_discs
+from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise_edges
+from kpbench.geometry.homography import project_discs
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
@@ -109,7 +109,7 @@ def random_placements(
         chosen = rng.integers(len(patches), size=tried)
         black, white = rng.uniform(*limits.black, tried), rng.uniform(*limits.white, tried)
         extent = np.array([patch.extent for patch in patches])[chosen]
-        centre, reach, _, _ = projected_discs(poses * np.stack([extent, extent, np.ones(tried)], axis=1)[:, None])
+        centre, reach, _, _ = project_discs(poses * np.stack([extent, extent, np.ones(tried)], axis=1)[:, None])
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
             # a wide rim of a steep patch may reach beyond the horizon
             seen = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
@@ -146,7 +146,7 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
         H[:, 0, :2] += (width_px - 1) / 2 * H[:, 2, :2]
         H[:, 1, :2] += (height_px - 1) / 2 * H[:, 2, :2]
         H[:, 0, 2], H[:, 1, 2], H[:, 2, 2] = x, y, 1.0
-        _, major, minor, _ = projected_discs(H)
+        _, major, minor, _ = project_discs(H)
         good = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
         # none so near, as in tiny images, that its depth varies by half or more
         found.append(H[good & (np.hypot(H[:, 2, 0], H[:, 2, 1]) <= 0.5)][:missing])
@@ -180,7 +180,7 @@ def rasterise(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> li
     if not placements:
         return []
     poses = np.stack([p.H_patch2image for p in placements])
-    _, major, _, _ = projected_discs(poses)
+    _, major, _, _ = project_discs(poses)
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     # rounded to a power of two, so that polygons are reused
     for p, tolerance in zip(placements, 2.0 ** np.floor(np.log2(tolerance_px / major)), strict=True):
@@ -190,9 +190,9 @@ def rasterise(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> li
         starts.append(points)
         ends.append(points[:, following])
         counts += [black, disc]
-        boxes += [box_around([points[:, black:].T])] * 2
+        boxes += [bounding_box([points[:, black:].T])] * 2
     owner = np.repeat(np.arange(len(counts)), counts)
-    covers = edge_coverage(np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), owner, boxes)
+    covers = rasterise_edges(np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), owner, boxes)
     return [Mask(boxes[n], covers[n], covers[n + 1]) for n in range(0, len(covers), 2)]
 
 
@@ -220,7 +220,7 @@ def tabulate(placements: Sequence[Placement], visible: Sequence[float]) -> NDArr
     keypoints = np.zeros(len(placements), KEYPOINT_DTYPE)
     if placements:
         H = keypoints["H_patch2image"] = np.stack([p.H_patch2image for p in placements])
-        _, keypoints["radius_major"], keypoints["radius_minor"], keypoints["axis_angle"] = projected_discs(H)
+        _, keypoints["radius_major"], keypoints["radius_minor"], keypoints["axis_angle"] = project_discs(H)
         keypoints["x"], keypoints["y"] = H[:, 0, 2] / H[:, 2, 2], H[:, 1, 2] / H[:, 2, 2]
         keypoints["patch_id"] = [p.patch.patch_id for p in placements]
         keypoints["visible"] = visible
@@ -230,7 +230,7 @@ def tabulate(placements: Sequence[Placement], visible: Sequence[float]) -> NDArr
 
 def paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
     """Draw one patch in place; return the fraction of it that lies in the image."""
-    there, here = inside_image(mask.box, image)
+    there, here = clip_to_image(mask.box, image)
     disc = mask.disc[here]
     if not disc.size:
         return 0.0
@@ -244,7 +244,7 @@ def paint(image: UInt8, mask: Mask, black: float, white: float) -> float:
 
 def share_inside(image: UInt8, mask: Mask) -> float:
     """The fraction of a patch that lies in the image."""
-    _, here = inside_image(mask.box, image)
+    _, here = clip_to_image(mask.box, image)
     return float(mask.disc[here].sum() / mask.disc.sum())
 
 
@@ -257,7 +257,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """
     contrast = np.full(len(masks), np.nan)
     for n, mask in enumerate(masks):
-        there, here = inside_image(mask.box, image)
+        there, here = clip_to_image(mask.box, image)
         part = image[there]
         grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
         share = mask.black[here].ravel()

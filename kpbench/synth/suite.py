@@ -21,7 +21,7 @@ from kpbench.dataset.shard import Sample
 from kpbench.degrade.ladder import apply, climb
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
-from kpbench.patches.board import CameraBoard, hexagon_board
+from kpbench.patches.board import BoardLike, hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, procedural
@@ -42,7 +42,7 @@ class Shot:
     condition: str
     rung: float
     scene: int
-    board: CameraBoard
+    board: BoardLike
     pose: Pose
     look: Look
     effects: list[dict[str, Any]]
@@ -114,7 +114,7 @@ class SuiteConfig:
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
     @cached_property
-    def boards(self) -> tuple[CameraBoard, ...]:
+    def boards(self) -> tuple[BoardLike, ...]:
         """The boards that are seen in every scene under every rung."""
         if self.board is not None:
             return (tag_board(self.board, BOARD_SIDE_MM),)

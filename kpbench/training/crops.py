@@ -14,7 +14,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kpbench.geometry.homography import projected_discs
+from kpbench.geometry.homography import project_discs
 from kpbench.images import resize
 from kpbench.patches.design import Patch
 from kpbench.render.lookalikes import draw_lookalikes
@@ -164,7 +164,7 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, l
         poses = first @ steps @ turns
         poses = poses[poses[:, 2, 2] > 0.2]
         poses /= poses[:, 2:, 2:]
-    centres, majors, minors, _ = projected_discs(poses)
+    centres, majors, minors, _ = project_discs(poses)
     alike = rng.random() < 0.5
     which = rng.integers(len(patches), size=len(poses))
     black = rng.uniform(*limits.black, len(poses))

@@ -13,7 +13,7 @@ from kpbench.analysis import measures as analysis
 from kpbench.analysis import search
 from kpbench.analysis.cell_images import Grid, attitudes, images, seen_cells
 from kpbench.geometry.camera import Camera
-from kpbench.geometry.coverage import coverage
+from kpbench.geometry.coverage import rasterise
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
 
 DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
@@ -50,7 +50,7 @@ def test_cells_add_up_to_the_design(patch, radius, turn, squeeze, shift):
     grid = Grid.of([patch])
     parts = images(grid.cells(1e-5), np.column_stack([A, shift])[None], half)[0]
     placed = [polygon @ A.T + shift for polygon in unit_polygons(patch, 1e-5)[0]]
-    exact = coverage([placed], [(-half, -half, 2 * half + 1, 2 * half + 1)])[0]
+    exact = rasterise([placed], [(-half, -half, 2 * half + 1, 2 * half + 1)])[0]
     np.testing.assert_allclose(grid.inks([patch])[0] @ parts, exact.ravel(), atol=2e-3)
     assert parts.sum() == pytest.approx(np.pi * radius**2 * squeeze, rel=1e-4)
 
@@ -88,7 +88,7 @@ def test_bound_equals_the_inverse_of_the_whole_information_matrix():
     def image(unknowns):
         x, y, a, b, c, d, black, white = unknowns
         A = np.array([[radius + a, b], [c, radius + d]])
-        ink, disc = (coverage([[p @ A.T + (x, y) for p in parts]], box)[0] for parts in unit_polygons(patch, 1e-5))
+        ink, disc = (rasterise([[p @ A.T + (x, y) for p in parts]], box)[0] for parts in unit_polygons(patch, 1e-5))
         return (128 * (1 - disc) + white * (disc - ink) + black * ink).ravel()
 
     at = np.array([0.0, 0, 0, 0, 0, 0, 128 - 90, 128 + 90])

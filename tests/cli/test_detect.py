@@ -14,7 +14,7 @@ from kpbench.dataset.generation import generate
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import predict_images
 from kpbench.errors import DataError
-from kpbench.images import Source, image_writer
+from kpbench.images import ImageSource, image_writer
 from kpbench.patches.design import load_patches
 from kpbench.predictions.files import read_predictions
 from kpbench.render.scene import Limits
@@ -134,7 +134,7 @@ def test_an_interrupt_keeps_what_an_endless_source_has_shown(length):
         yield "0.png", np.zeros((8, 8), np.uint8)
         raise KeyboardInterrupt
 
-    source = Source(images(), length)
+    source = ImageSource(images(), length)
     detector = LoadedDetector("none", "1", lambda image: Detections.none())
     with nullcontext() if length is None else pytest.raises(KeyboardInterrupt):
         assert len(predict_images(source, detector).predictions) == 1

@@ -21,7 +21,7 @@ from kpbench.degrade.effects import (
 )
 from kpbench.degrade.ladder import FUNCTIONS, LADDER, apply, climb
 from kpbench.errors import DataError
-from kpbench.geometry.coverage import coverage
+from kpbench.geometry.coverage import rasterise
 
 RUNGS = [(effect, level) for effect, rungs in LADDER.items() for level in rungs.levels]
 BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")
@@ -166,7 +166,7 @@ def test_occlusion_hides_the_share_it_says(level):
     angles = np.radians(np.arange(360))
     for x, y, radius in discs:
         rim = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
-        disc = coverage([[rim]], [(0, 0, 180, 120)])[0]
+        disc = rasterise([[rim]], [(0, 0, 180, 120)])[0]
         assert np.isclose((disc * cover).sum() / disc.sum(), level / 100, atol=0.01)
     image = np.full((120, 180), 255, np.uint8)
     assert ((occlusion(image, recorded["strips"]) < 255) == (cover > 1 / 255)).mean() > 0.999

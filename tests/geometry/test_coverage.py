@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.coverage import bounding_box, rasterise
 from kpbench.geometry.outline import circle, flatten, rectangle
 
 coordinate = st.floats(-30, 30)
@@ -14,8 +14,8 @@ def area(polygon):
 
 
 def rasterised(polygons):
-    box = box_around(polygons)
-    return coverage([polygons], [box])[0], box
+    box = bounding_box(polygons)
+    return rasterise([polygons], [box])[0], box
 
 
 @given(st.lists(st.tuples(coordinate, coordinate), min_size=3, max_size=3, unique=True))
@@ -69,11 +69,11 @@ def test_coverage_agrees_with_counting_subsamples(seed):
 
 def test_many_regions_in_one_call_are_the_same_as_one_by_one():
     regions = [flatten(circle(3.3 * k, -2.1 * k, 1.5 + k), 1e-3) for k in range(5)]
-    boxes = [box_around(polygons) for polygons in regions]
-    together = coverage(regions, boxes)
+    boxes = [bounding_box(polygons) for polygons in regions]
+    together = rasterise(regions, boxes)
     for polygons, box, cover in zip(regions, boxes, together, strict=True):
-        assert np.allclose(coverage([polygons], [box])[0], cover, atol=1e-12)
+        assert np.allclose(rasterise([polygons], [box])[0], cover, atol=1e-12)
 
 
 def test_a_region_without_polygons_is_empty():
-    assert not coverage([[]], [(0, 0, 3, 2)])[0].any()
+    assert not rasterise([[]], [(0, 0, 3, 2)])[0].any()

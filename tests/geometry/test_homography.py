@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
-from kpbench.geometry.homography import project, projected_disc
+from kpbench.geometry.homography import project, project_disc
 
 angles = st.floats(-70, 70)
 
@@ -17,7 +17,7 @@ def homography(x_deg, y_deg, z_deg, depth):
 @given(angles, angles, st.floats(0, 360), st.floats(3, 50))
 def test_projected_disc_agrees_with_projected_rim_points(x_deg, y_deg, z_deg, depth):
     H = homography(x_deg, y_deg, z_deg, depth)
-    ellipse = projected_disc(H)
+    ellipse = project_disc(H)
     t = np.linspace(0, 2 * np.pi, 720, endpoint=False)
     rim = project(H, np.column_stack([np.cos(t), np.sin(t)]))
     c, s = np.cos(np.radians(ellipse.angle_deg)), np.sin(np.radians(ellipse.angle_deg))
@@ -29,7 +29,7 @@ def test_projected_disc_agrees_with_projected_rim_points(x_deg, y_deg, z_deg, de
 
 def test_a_disc_that_reaches_the_horizon_is_refused():
     with pytest.raises(ValueError, match="horizon"):
-        projected_disc(homography(80, 0, 0, 0.5))
+        project_disc(homography(80, 0, 0, 0.5))
 
 
 def test_the_principal_point_is_the_middle_of_the_pixel_grid():

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpbench.errors import DesignError
-from kpbench.geometry.coverage import box_around, coverage
+from kpbench.geometry.coverage import bounding_box, rasterise
 from kpbench.patches.design import Patch, SemiCircle, load_patches, parse_patch, shipped_patches, unit_polygons
 
 semicircles = st.builds(
@@ -49,8 +49,8 @@ def test_the_outline_covers_the_black_cells_exactly(patch):
     if not polygons:
         assert expected < 1e-12
         return
-    x, y, w, h = box = box_around(polygons)
-    cover = coverage([polygons], [box])[0]
+    x, y, w, h = box = bounding_box(polygons)
+    cover = rasterise([polygons], [box])[0]
     assert np.isclose(cover.sum(), 900 * expected, rtol=1e-5)
     middle = np.stack(np.meshgrid(x + np.arange(w), y + np.arange(h)), axis=-1) / 30
     clear = (cover < 1e-9) | (cover > 1 - 1e-9)  # pixels that no edge crosses

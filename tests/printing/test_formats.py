@@ -15,12 +15,12 @@ from PIL import Image
 import kpbench.printing.page
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import Arc, Line, circle, move, rectangle
-from kpbench.printing.dxf import dxf
+from kpbench.printing.dxf import to_dxf
 from kpbench.printing.formats import WRITERS
 from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror
-from kpbench.printing.pdf import pdf
-from kpbench.printing.png import png, px_per_mm
-from kpbench.printing.svg import svg
+from kpbench.printing.pdf import to_pdf
+from kpbench.printing.png import px_per_mm, to_png
+from kpbench.printing.svg import to_svg
 
 RADIUS, AT = 15.0, (40.3, 61.7)
 HALF_DISC = ((Arc(0, 0, 1, 0, 180), Line(-1, 0, 1, 0)),)
@@ -51,10 +51,10 @@ def page_of(region, *texts, layer=INK, size=(100.0, 120.0)):
 def measured(suffix, page, tmp_path):
     """Area in mm² and centroid in mm of the first shape, by the independent readers."""
     if suffix == ".svg":
-        return readers.moments(readers.svg_shapes(svg(page))[0][0])
+        return readers.moments(readers.svg_shapes(to_svg(page))[0][0])
     if suffix == ".pdf":
-        return readers.moments(readers.pdf_shapes(pdf([page]))[0][0][0])
-    contours, _ = readers.dxf_shapes(dxf(page), tmp_path / "a.dxf")
+        return readers.moments(readers.pdf_shapes(to_pdf([page]))[0][0][0])
+    contours, _ = readers.dxf_shapes(to_dxf(page), tmp_path / "a.dxf")
     return readers.moments([part for contour in contours for part in contour])
 
 
@@ -100,22 +100,22 @@ def test_any_sector_is_where_it_should_be_in_svg_and_pdf(x, y, radius, turn, swe
     middle = np.radians(turn + sign * sweep / 2)
     expected = x + out * np.cos(middle), y + out * np.sin(middle)
     for _, got in (
-        readers.moments(readers.svg_shapes(svg(page))[0][0]),
-        readers.moments(readers.pdf_shapes(pdf([page]))[0][0][0]),
+        readers.moments(readers.svg_shapes(to_svg(page))[0][0]),
+        readers.moments(readers.pdf_shapes(to_pdf([page]))[0][0][0]),
     ):
         np.testing.assert_allclose(got, expected, atol=5e-4)  # half a µm, with sectors as small as 0.5 mm
 
 
 def test_pdf_edge_is_a_circle_to_a_tenth_of_a_micrometre():
     page = page_of(circle(0, 0, 1))
-    segments = readers.pdf_shapes(pdf([page]))[0][0][0]
+    segments = readers.pdf_shapes(to_pdf([page]))[0][0][0]
     assert len(segments) >= 8
     off = np.concatenate([np.hypot(*(points - AT).T) for points, _ in segments]) - RADIUS
     assert np.abs(off).max() < 1e-4  # mm
 
 
 def test_svg_circle_is_made_of_true_arcs():
-    content = svg(page_of(circle(0, 0, 1))).decode()
+    content = to_svg(page_of(circle(0, 0, 1))).decode()
     path = content.split(' d="')[1].split('"')[0]
     assert path.count("A15 15") == 4
     assert "L" not in path
@@ -124,11 +124,11 @@ def test_svg_circle_is_made_of_true_arcs():
 
 def test_svg_numbers_keep_the_nanometre():
     page = Page(100, 100, (Shape(rectangle(1.234567, -0.0, 2.0000014, 3)),), (), "")
-    assert 'd="M1.234567 0L3.234568 0L3.234568 3' in svg(page).decode()
+    assert 'd="M1.234567 0L3.234568 0L3.234568 3' in to_svg(page).decode()
 
 
 def test_pdf_asks_not_to_be_scaled_and_says_what_it_is():
-    document = pikepdf.open(io.BytesIO(pdf([page_of(HALF_DISC), page_of(RING)])))
+    document = pikepdf.open(io.BytesIO(to_pdf([page_of(HALF_DISC), page_of(RING)])))
     assert len(document.pages) == 2
     assert document.Root.ViewerPreferences.PrintScaling == "/None"
     assert document.docinfo["/Title"] == "a test"
@@ -138,17 +138,17 @@ def test_pdf_asks_not_to_be_scaled_and_says_what_it_is():
 @pytest.mark.parametrize("size", [(210.0, 297.0), (215.9, 355.6), (123.4, 56.7)])
 def test_page_sizes(size, tmp_path):
     page = page_of(HALF_DISC, size=size)
-    assert readers.svg_shapes(svg(page))[1] == size
-    np.testing.assert_allclose(readers.pdf_shapes(pdf([page]))[1][0], size, atol=1e-4)
-    assert readers.dxf_shapes(dxf(page), tmp_path / "a.dxf")[1].header["$EXTMAX"][:2] == pytest.approx(size)
-    image = Image.open(io.BytesIO(png(page, 300)))
+    assert readers.svg_shapes(to_svg(page))[1] == size
+    np.testing.assert_allclose(readers.pdf_shapes(to_pdf([page]))[1][0], size, atol=1e-4)
+    assert readers.dxf_shapes(to_dxf(page), tmp_path / "a.dxf")[1].header["$EXTMAX"][:2] == pytest.approx(size)
+    image = Image.open(io.BytesIO(to_png(page, 300)))
     assert image.size == tuple(round(side * px_per_mm(300)) for side in size)
 
 
 @pytest.mark.parametrize("dpi", [72, 150, 300, 600, 1200])
 def test_png_says_its_resolution_and_is_drawn_at_it(dpi):
     page = Page(30, 30, (Shape(move(HALF_DISC, 12.3, 14.5, 10)),), (), "")
-    content = png(page, dpi)
+    content = to_png(page, dpi)
     image = Image.open(io.BytesIO(content))
     assert image.mode == "L"
     assert round(image.info["dpi"][0]) == round(image.info["dpi"][1]) == dpi
@@ -164,12 +164,12 @@ def test_png_says_its_resolution_and_is_drawn_at_it(dpi):
 
 def test_png_that_would_not_fit_in_memory_is_refused():
     with pytest.raises(DesignError, match="use a lower --dpi"):
-        png(page_of(HALF_DISC, size=(3000.0, 3000.0)), 4800)
+        to_png(page_of(HALF_DISC, size=(3000.0, 3000.0)), 4800)
 
 
 def test_png_clips_what_hangs_over_the_page():
     page = Page(10, 10, (Shape(circle(0, 0, 4)), Shape(circle(10, 10, 4))), (), "")
-    ink = 255.0 - np.asarray(Image.open(io.BytesIO(png(page, 254))))
+    ink = 255.0 - np.asarray(Image.open(io.BytesIO(to_png(page, 254))))
     assert ink.sum() / 255 == pytest.approx(2 * np.pi * 40**2 / 4, rel=1e-3)
     np.testing.assert_allclose(ink, ink[::-1, ::-1], atol=1)
     assert (ink[0, 0], ink[0, -1]) == (255, 0)
@@ -183,7 +183,7 @@ def test_dxf_is_y_up_with_its_layers(tmp_path):
         (Text("ab", 30, 110, 4, "end"),),
         "",
     )
-    _, drawing = readers.dxf_shapes(dxf(page), tmp_path / "a.dxf")
+    _, drawing = readers.dxf_shapes(to_dxf(page), tmp_path / "a.dxf")
     assert drawing.dxfversion == "AC1015"
     disc = drawing.modelspace().query('LWPOLYLINE[layer=="INK"]')[0]
     assert [(x, y, abs(b)) for x, y, b in disc.get_points("xyb")] == [(15, 100, 1), (5, 100, 1)]
@@ -194,10 +194,10 @@ def test_dxf_is_y_up_with_its_layers(tmp_path):
 
 def test_cut_lines_are_in_dxf_only(tmp_path):
     page = page_of(circle(0, 0, 1), layer=CUT)
-    assert "<path" not in svg(page).decode()
-    assert readers.pdf_shapes(pdf([page]))[0] == [[]]
-    assert np.asarray(Image.open(io.BytesIO(png(page, 100)))).min() == 255
-    assert len(readers.dxf_shapes(dxf(page), tmp_path / "a.dxf", CUT)[0]) == 1
+    assert "<path" not in to_svg(page).decode()
+    assert readers.pdf_shapes(to_pdf([page]))[0] == [[]]
+    assert np.asarray(Image.open(io.BytesIO(to_png(page, 100)))).min() == 255
+    assert len(readers.dxf_shapes(to_dxf(page), tmp_path / "a.dxf", CUT)[0]) == 1
 
 
 AWKWARD = 'a<b & "c" %%d \\P é 中 \U0001f600 \x00\n'
@@ -206,18 +206,18 @@ AWKWARD = 'a<b & "c" %%d \\P é 中 \U0001f600 \x00\n'
 @pytest.mark.parametrize("anchor", ["start", "middle", "end"])
 def test_any_text_can_be_written(anchor, tmp_path):
     page = page_of(HALF_DISC, Text(AWKWARD, 50, 20, 3, anchor), Text(AWKWARD, 50, 30, 3, anchor, mirrored=True))
-    assert 'a<b & "c" %%d \\P é 中 \U0001f600 ??' in "".join(readers.ET.fromstring(svg(page)).itertext())
-    assert len(readers.pdf_shapes(pdf([page]))[0][0]) == 1
-    drawing = readers.dxf_shapes(dxf(page), tmp_path / "a.dxf")[1]
+    assert 'a<b & "c" %%d \\P é 中 \U0001f600 ??' in "".join(readers.ET.fromstring(to_svg(page)).itertext())
+    assert len(readers.pdf_shapes(to_pdf([page]))[0][0]) == 1
+    drawing = readers.dxf_shapes(to_dxf(page), tmp_path / "a.dxf")[1]
     assert drawing.modelspace().query("TEXT")[0].dxf.text.startswith('a<b & "c" ')
-    assert Image.open(io.BytesIO(png(page, 100))).size == (394, 472)
+    assert Image.open(io.BytesIO(to_png(page, 100))).size == (394, 472)
 
 
 def test_text_stands_where_its_anchor_says():
     for anchor, low, high in (("start", 50, 75), ("middle", 37, 63), ("end", 25, 50)):
         for mirrored in (False, True):
             page = Page(100, 40, (), (Text("HHHHHHHH", 50, 20, 4, anchor, mirrored),), "")
-            dark = np.argwhere(np.asarray(Image.open(io.BytesIO(png(page, 254)))) < 128) / px_per_mm(254)
+            dark = np.argwhere(np.asarray(Image.open(io.BytesIO(to_png(page, 254)))) < 128) / px_per_mm(254)
             limits = (100 - high, 100 - low) if mirrored else (low, high)
             assert limits[0] - 0.2 <= dark[:, 1].min() <= dark[:, 1].max() <= limits[1] + 0.2
             assert 16 <= dark[:, 0].min() <= dark[:, 0].max() <= 20.1
@@ -241,7 +241,7 @@ def test_draw_knows_no_patch():
 
 @pytest.mark.skipif(not shutil.which("qpdf"), reason="needs qpdf")
 def test_qpdf_finds_no_fault(tmp_path):
-    (tmp_path / "a.pdf").write_bytes(pdf([page_of(PIE, Text("x", 1, 1, 3)), page_of(RING)]))
+    (tmp_path / "a.pdf").write_bytes(to_pdf([page_of(PIE, Text("x", 1, 1, 3)), page_of(RING)]))
     done = subprocess.run(["qpdf", "--check", tmp_path / "a.pdf"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "No syntax or stream encoding errors found" in done.stdout
@@ -249,7 +249,7 @@ def test_qpdf_finds_no_fault(tmp_path):
 
 @pytest.mark.skipif(not shutil.which("pdfimages"), reason="needs poppler")
 def test_pdf_holds_no_image(tmp_path):
-    (tmp_path / "a.pdf").write_bytes(pdf([page_of(PIE)]))
+    (tmp_path / "a.pdf").write_bytes(to_pdf([page_of(PIE)]))
     done = subprocess.run(["pdfimages", "-list", tmp_path / "a.pdf"], capture_output=True, text=True, check=True)
     assert len(done.stdout.splitlines()) == 2, "a header and nothing below"
 
@@ -258,22 +258,22 @@ def test_pdf_holds_no_image(tmp_path):
 def test_mirrored_pages_are_mirror_images_text_and_all(tmp_path):
     page = Page(100, 50, (), (Text("RE", 10, 40, 24), Text("FL", 95, 40, 24, "end")), "")
     for name, drawn in (("a", page), ("b", mirror(page))):
-        (tmp_path / f"{name}.pdf").write_bytes(pdf([drawn]))
+        (tmp_path / f"{name}.pdf").write_bytes(to_pdf([drawn]))
         subprocess.run(["pdftoppm", "-r", "127", "-gray", "-singlefile", f"{name}.pdf", name], cwd=tmp_path, check=True)
     for straight, mirrored in (
         [np.asarray(Image.open(tmp_path / f"{name}.pgm")) for name in ("a", "b")],
-        [np.asarray(Image.open(io.BytesIO(png(drawn, 127)))) for drawn in (page, mirror(page))],
+        [np.asarray(Image.open(io.BytesIO(to_png(drawn, 127)))) for drawn in (page, mirror(page))],
     ):
         ink, seen = (255.0 - grey[:250, :500] for grey in (straight, mirrored))  # poppler adds a row and a column
         assert np.abs(ink - seen[:, ::-1]).sum() < 0.15 * ink.sum()
         assert np.abs(ink - seen).sum() > ink.sum()
-    assert svg(mirror(page)).count(b"matrix(-1 0 0 1 ") == 2
+    assert to_svg(mirror(page)).count(b"matrix(-1 0 0 1 ") == 2
 
 
 def test_the_pdf_embeds_its_font():
     """Print shops refuse a PDF that leaves the font to them."""
     page = Page(60.0, 40.0, (), (Text("30 mm, \u4e2d", 5, 10, 3),), "t")
-    document = pikepdf.open(io.BytesIO(pdf([page])))
+    document = pikepdf.open(io.BytesIO(to_pdf([page])))
     fonts = document.pages[0].Resources.Font
     assert len(fonts) == 1
     assert all("/FontFile2" in font.FontDescriptor for font in fonts.values())

@@ -15,15 +15,15 @@ from kpbench.errors import DataError, DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import parse_patch, shipped_patches
-from kpbench.printing.dxf import dxf
+from kpbench.printing.dxf import to_dxf
 from kpbench.printing.formats import WRITERS
 from kpbench.printing.page import CUT, INK, MARKS
-from kpbench.printing.pdf import pdf
-from kpbench.printing.png import png
-from kpbench.printing.sheet import PAPERS, Paper, board_sheet, parse_paper, patch_sheet, save_sheet
-from kpbench.printing.svg import svg
+from kpbench.printing.pdf import to_pdf
+from kpbench.printing.png import to_png
+from kpbench.printing.sheet import PAGE_SIZES_MM, PageFormat, board_sheet, parse_page_format, patch_sheet, save_sheet
+from kpbench.printing.svg import to_svg
 
-A4 = Paper(210, 297)
+A4 = PageFormat(210, 297)
 # A rim and a quiet zone, rings, three directions of edges, and no symmetry.
 RIMMED = parse_patch(
     {
@@ -52,12 +52,12 @@ MIXED = Board(
 )
 SHEETS = {
     "patches": patch_sheet(PATCHES, 30, A4),
-    "copies": patch_sheet(PATCHES, 33.3, Paper(150, 120), copies=3),
-    "tiny": patch_sheet(PATCHES, 5, Paper(60, 60)),
+    "copies": patch_sheet(PATCHES, 33.3, PageFormat(150, 120), copies=3),
+    "tiny": patch_sheet(PATCHES, 5, PageFormat(60, 60)),
     "grid": board_sheet(grid_board(PATCHES, 4, 3, 30, 60), A4),
     "mixed": board_sheet(MIXED, A4),
-    "mirrored": board_sheet(MIXED, Paper(210, 297, mirrored=True)),
-    "bare": patch_sheet(PATCHES, 30, Paper(210, 297, labels=False)),
+    "mirrored": board_sheet(MIXED, PageFormat(210, 297, mirrored=True)),
+    "bare": patch_sheet(PATCHES, 30, PageFormat(210, 297, labels=False)),
     "tiled": board_sheet(hexagon_board(RIMMED, 350), A4, tile=True),
     **{f"hexagon-{p.patch_id}": board_sheet(hexagon_board(p, 187.5), A4) for p in PATCHES},
 }
@@ -80,9 +80,9 @@ def worst_mm(shapes, expected):
 @pytest.mark.parametrize("name", SHEETS)
 def test_svg_and_pdf_put_every_keypoint_where_the_sidecar_says(name):
     sheet = SHEETS[name]
-    pages, sizes = readers.pdf_shapes(pdf(sheet.pages))
+    pages, sizes = readers.pdf_shapes(to_pdf(sheet.pages))
     for n, _, expected in by_page(sheet):
-        shapes, size = readers.svg_shapes(svg(sheet.pages[n]))
+        shapes, size = readers.svg_shapes(to_svg(sheet.pages[n]))
         assert list(size) == sheet.sidecar["page_mm"]
         assert worst_mm(shapes, expected) < 1e-5
         printed = [s for s in sheet.pages[n].shapes if s.layer != CUT]
@@ -96,7 +96,7 @@ def test_svg_and_pdf_put_every_keypoint_where_the_sidecar_says(name):
 def test_dxf_puts_every_keypoint_where_the_sidecar_says(name, tmp_path):
     sheet = SHEETS[name]
     for n, here, expected in by_page(sheet):
-        contours, _ = readers.dxf_shapes(dxf(sheet.pages[n]), tmp_path / "a.dxf")
+        contours, _ = readers.dxf_shapes(to_dxf(sheet.pages[n]), tmp_path / "a.dxf")
         counts = [len(s.region) for s in sheet.pages[n].shapes if s.layer == INK]
         parts = iter(contours)
         shapes = [[seg for _ in range(count) for seg in next(parts)] for count in counts]
@@ -111,7 +111,7 @@ def test_png_puts_every_keypoint_where_the_sidecar_says(name, dpi, tmp_path):
     saved = json.loads(next(tmp_path.glob("*.json")).read_text())
     scale = saved["png"]["px_per_mm"]
     for n, here, expected in by_page(sheet):
-        grey = np.asarray(Image.open(io.BytesIO(png(sheet.pages[n], dpi))))
+        grey = np.asarray(Image.open(io.BytesIO(to_png(sheet.pages[n], dpi))))
         for k, mm in zip(here, expected, strict=True):
             patch = next(p for p in PATCHES if p.patch_id == k["patch_id"])
             reach = (patch.extent * k["diameter_mm"] / 2 + 0.5) * scale  # cut marks begin 1 mm off
@@ -137,7 +137,7 @@ def test_marks_keep_clear_of_the_ink():
 
 
 def test_rulers_measure_what_they_say():
-    for paper, lengths in ((A4, (100, 100)), (Paper(70, 120), (40, 90)), (Paper(40, 40), (10, 10))):
+    for paper, lengths in ((A4, (100, 100)), (PageFormat(70, 120), (40, 90)), (PageFormat(40, 40), (10, 10))):
         assert paper.rulers == lengths
         page = patch_sheet(PATCHES[:1], 3, paper).pages[0]
         for axis, (shape, length) in enumerate(zip(page.shapes[:2], lengths, strict=True)):
@@ -177,7 +177,7 @@ def test_copies_run_over_pages():
     assert [k["page"] for k in sheet.sidecar["keypoints"]] == sorted(k["page"] for k in sheet.sidecar["keypoints"])
 
 
-@pytest.mark.parametrize("paper", [A4, Paper(297, 210), Paper(60, 400), Paper(40, 40)])
+@pytest.mark.parametrize("paper", [A4, PageFormat(297, 210), PageFormat(60, 400), PageFormat(40, 40)])
 def test_what_does_not_fit_names_the_largest_that_does(paper):
     def largest(draw):
         with pytest.raises(DesignError, match="the largest diameter that") as caught:
@@ -202,11 +202,11 @@ def test_a4_holds_the_thirty_mm_hexagon():
         board_sheet(hexagon_board(PATCHES[0], 200), A4)
 
 
-@pytest.mark.parametrize("name", PAPERS)
+@pytest.mark.parametrize("name", PAGE_SIZES_MM)
 def test_papers(name):
-    width, height = PAPERS[name]
-    assert parse_paper(name.upper()) == Paper(width, height)
-    assert parse_paper(name, landscape=True) == Paper(height, width)
+    width, height = PAGE_SIZES_MM[name]
+    assert parse_page_format(name.upper()) == PageFormat(width, height)
+    assert parse_page_format(name, landscape=True) == PageFormat(height, width)
     if name[0] == "a":  # ISO 216: each is half of the one before, in whole mm
         long = round(1000 * 2 ** (0.25 - int(name[1]) / 2))
         assert abs(height - long) <= 1
@@ -214,14 +214,14 @@ def test_papers(name):
 
 
 def test_custom_papers():
-    assert parse_paper("600x400mm") == parse_paper("600X400") == Paper(600, 400)
-    assert parse_paper("100.5x99.25mm", labels=False, mirrored=True) == Paper(100.5, 99.25, False, True)
+    assert parse_page_format("600x400mm") == parse_page_format("600X400") == PageFormat(600, 400)
+    assert parse_page_format("100.5x99.25mm", labels=False, mirrored=True) == PageFormat(100.5, 99.25, False, True)
     for bad in ("a9", "", "10x", "x10", "-50x50mm", "100x100in", "1e3x100", "nanx100"):
         with pytest.raises(DesignError, match="is not known, expected a4, a3"):
-            parse_paper(bad)
+            parse_page_format(bad)
     for bad in ("39x100mm", "100x5001mm"):
         with pytest.raises(DesignError, match="expected 40 to 5000 mm a side"):
-            parse_paper(bad)
+            parse_page_format(bad)
 
 
 def test_sidecar_of_a_board_goes_into_solvepnp():
@@ -302,7 +302,7 @@ def test_tiles_put_together_by_their_marks_are_the_board(tmp_path):
     dpi, known = 200, RIMMED
     px = dpi / 25.4
     sheet = SHEETS["tiled"]
-    images = poppler(pdf(sheet.pages), tmp_path, dpi)
+    images = poppler(to_pdf(sheet.pages), tmp_path, dpi)
     assert len(images) == 4
     errors = []
     for image, tile in zip(images, sheet.sidecar["tiles"], strict=True):
@@ -334,14 +334,14 @@ def test_tiles_put_together_by_their_marks_are_the_board(tmp_path):
 @pytest.mark.skipif(not shutil.which("pdftoppm"), reason="needs poppler")
 def test_poppler_sees_the_keypoints_too(tmp_path):
     sheet = SHEETS["mixed"]
-    (grey,) = poppler(pdf(sheet.pages), tmp_path, 300)
+    (grey,) = poppler(to_pdf(sheet.pages), tmp_path, 300)
     check_raster(sheet, grey, 300 / 25.4, 0.2)  # it samples each pixel 4 x 4 times
 
 
 def test_pdfium_sees_the_keypoints_too():
     """It places an edge anywhere in a pixel, but stretches a page to whole pixels, as this one is."""
-    sheet, dpi = board_sheet(MIXED, Paper(254, 381)), 300
-    drawn = pypdfium2.PdfDocument(pdf(sheet.pages))[0].render(scale=dpi / 72, grayscale=True).to_numpy()
+    sheet, dpi = board_sheet(MIXED, PageFormat(254, 381)), 300
+    drawn = pypdfium2.PdfDocument(to_pdf(sheet.pages))[0].render(scale=dpi / 72, grayscale=True).to_numpy()
     assert drawn.shape[:2] == (4500, 3000)
     check_raster(sheet, drawn.reshape(4500, 3000).astype(float), dpi / 25.4, 0.05)
 
@@ -349,7 +349,7 @@ def test_pdfium_sees_the_keypoints_too():
 @pytest.mark.skipif(not shutil.which("rsvg-convert"), reason="needs librsvg")
 def test_librsvg_sees_the_keypoints_too(tmp_path):
     sheet = SHEETS["mixed"]
-    (tmp_path / "a.svg").write_bytes(svg(sheet.pages[0]))
+    (tmp_path / "a.svg").write_bytes(to_svg(sheet.pages[0]))
     command = ["rsvg-convert", "-d", "300", "-p", "300", "-b", "white", "-o", "a.png", "a.svg"]
     subprocess.run(command, cwd=tmp_path, check=True)
     check_raster(sheet, np.asarray(Image.open(tmp_path / "a.png").convert("L")).astype(float), 300 / 25.4, 0.05)

@@ -6,11 +6,11 @@ import pytest
 from kpbench.errors import DesignError
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.printing.sheet import Paper, board_sheet, patch_sheet, save_sheet
+from kpbench.printing.sheet import PageFormat, board_sheet, patch_sheet, save_sheet
 from kpbench.printing.sidecar import correct_sidecars, corrected
 
-BOARD = board_sheet(hexagon_board(shipped_patches()[0], 350), Paper(210, 297), tile=True)
-SHEET = patch_sheet(shipped_patches(), 20, Paper(120, 80))
+BOARD = board_sheet(hexagon_board(shipped_patches()[0], 350), PageFormat(210, 297), tile=True)
+SHEET = patch_sheet(shipped_patches(), 20, PageFormat(120, 80))
 
 
 def test_positions_follow_each_ruler():

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from kpbench.errors import DesignError
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.printing.tiling import tiles_of
+from kpbench.printing.tiling import cut_into_tiles
 
 PATCH = shipped_patches()[0]
 
@@ -27,7 +27,7 @@ def check(board, tiles, room_x, room_y):
 
 
 def test_a_board_that_fits_is_one_tile():
-    (tile,) = tiles_of(hexagon_board(PATCH, 187.5), 188, 275)
+    (tile,) = cut_into_tiles(hexagon_board(PATCH, 187.5), 188, 275)
     assert (tile.x0, tile.x1, tile.y0, tile.y1) == (-93.75, 93.75, -93.75, 93.75)
     assert (tile.row, tile.column) == (0, 0)
 
@@ -35,7 +35,7 @@ def test_a_board_that_fits_is_one_tile():
 @given(side=st.floats(20, 700))
 def test_hexagons_of_any_size_are_cut_between_patches(side):
     board = hexagon_board(PATCH, side)
-    tiles = tiles_of(board, 188, 275)
+    tiles = cut_into_tiles(board, 188, 275)
     check(board, tiles, 188, 275)
     assert [(t.row, t.column) for t in tiles] == sorted((t.row, t.column) for t in tiles)
 
@@ -43,19 +43,19 @@ def test_hexagons_of_any_size_are_cut_between_patches(side):
 @given(rows=st.integers(1, 9), columns=st.integers(1, 9), pitch=st.floats(15, 150), room=st.floats(160, 400))
 def test_grids_of_any_size_are_cut_between_patches(rows, columns, pitch, room):
     board = grid_board([PATCH], rows, columns, 12, pitch)
-    check(board, tiles_of(board, room, room), room, room)
+    check(board, cut_into_tiles(board, room, room), room, room)
 
 
 def test_seams_lie_amid_the_gaps():
     board = board_of([(-40, 0), (30, 0)], (100, 20))
-    first, second = tiles_of(board, 80, 20)
+    first, second = cut_into_tiles(board, 80, 20)
     assert first.x1 == second.x0 == pytest.approx((-35 + 25) / 2)
 
 
 def test_seams_step_back_no_further_than_the_page_allows():
     board = board_of([(70, 0)], (150, 20))  # the gap reaches from -75 to 64
-    assert tiles_of(board, 100, 20)[0].x1 == pytest.approx(-5.5)
-    assert tiles_of(board, 76, 20)[0].x1 == pytest.approx(-1.0)
+    assert cut_into_tiles(board, 100, 20)[0].x1 == pytest.approx(-5.5)
+    assert cut_into_tiles(board, 76, 20)[0].x1 == pytest.approx(-1.0)
 
 
 @pytest.mark.parametrize(
@@ -67,4 +67,4 @@ def test_seams_step_back_no_further_than_the_page_allows():
 )
 def test_no_seam_through_a_patch(points, size):
     with pytest.raises(DesignError, match=r"'b' cannot be tiled: no straight seam .* within the 50 mm"):
-        tiles_of(board_of(points, size), 50, 60)
+        cut_into_tiles(board_of(points, size), 50, 60)

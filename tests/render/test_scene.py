@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench.geometry.homography import project, projected_disc
+from kpbench.geometry.homography import project, project_disc
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement, measure_contrast, random_placements, render_scene
 
@@ -61,7 +61,7 @@ def test_truth_is_the_projected_centre(patch):
     for p in random_placements(rng, 640, 480, (patch,), Limits(count=(6, 6))):
         k = render_scene(np.zeros((480, 640), np.uint8), [p]).keypoints[0]
         assert np.allclose([k["x"], k["y"]], project(p.H_patch2image, [[0, 0]])[0], atol=1e-9)
-        ellipse = projected_disc(p.H_patch2image)
+        ellipse = project_disc(p.H_patch2image)
         assert np.isclose(k["radius_major"], ellipse.major, rtol=1e-6)
         assert k["patch_id"] == patch.patch_id
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kpbench.errors import DataError
-from kpbench.geometry.homography import projected_disc
+from kpbench.geometry.homography import project_disc
 from kpbench.patches.design import shipped_patches
 from kpbench.render.scene import Limits, Placement
 from kpbench.training.batches import Job, SampleConfig, load_photos, make_batch, training_batches
@@ -76,7 +76,7 @@ def test_poses_keep_the_papers_limits_wherever_they_are_put(seed):
     limits, at = Limits(), np.array([[-4.0, 90.0], [30.0, 31.0]])
     for H, place in zip(_poses(np.random.default_rng(seed), at, limits), at, strict=True):
         assert H[:, 2] == pytest.approx([*place, 1], abs=1e-9)
-        ellipse = projected_disc(H)
+        ellipse = project_disc(H)
         assert 2 * ellipse.minor >= limits.minor_axis_px - 1e-6
         assert (ellipse.major - ellipse.minor) / ellipse.major <= limits.axis_difference + 1e-9
 
