@@ -28,7 +28,6 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
     Examples:
       kpbench demo
     """
-    from kpbench.cli import main
     from kpbench.files import require_own_folder
 
     require_own_folder(out, "print", "the demo")
@@ -41,14 +40,15 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
         ("detect", ["detect", str(data), "--detector", detector, "--out", str(preds)]),
         ("score", ["score", str(preds), "--json", str(out / "scores.json")]),
     ]
+    kpbench = ctx.find_root().command
     for title, arguments in steps:
         click.secho(f"\n{title}: kpbench {' '.join(arguments)}", bold=True)
-        with main.make_context("kpbench", arguments, parent=ctx.parent) as step:
-            main.invoke(step)
+        with kpbench.make_context("kpbench", arguments, parent=ctx.parent) as step:
+            kpbench.invoke(step)
     click.secho("\nOpen:", bold=True)
-    for name, what in (
+    for name, content in (
         ("print/patches.pdf", "the print sheet"),
         ("contact-sheet.png", "images with their true keypoints"),
         ("scores.json", "the scores, all of them"),
     ):
-        click.echo(f"  {out / name}  {what}")
+        click.echo(f"  {out / name}  {content}")
