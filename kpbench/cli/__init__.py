@@ -10,11 +10,10 @@ import sys
 import click
 
 from kpbench import __version__
-from kpbench.cli.messages import name_options
 from kpbench.errors import KpbenchError
 
-# Each command lives in a module that is imported only when the command is used: `kpbench --help`
-# must not wait for OpenCV, HDF5 or torch. The second entry is its line in the list of commands.
+# The module of a command is imported when the command is run: `kpbench --help` must not wait for OpenCV, HDF5 or torch.
+# Each entry holds the place of a command and its line in the list of commands.
 COMMANDS = {
     "render-patches": ("print:render_patches", "Print the patches or a board, true to scale."),
     "analyze-patches": ("analyze:analyze_patches", "Measure how well designs can be located and told apart."),
@@ -37,7 +36,7 @@ COMMANDS = {
 
 
 class LazyGroup(click.Group):
-    """A group that imports a command's module when the command is run, and turns errors into exit codes."""
+    """The group of all commands: it imports a command when it is run, and turns errors into exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -59,10 +58,10 @@ class LazyGroup(click.Group):
         except KpbenchError as error:
             click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
-        except OSError as error:  # of standard output, mostly: what we write ourselves is a KpbenchError
-            if not isinstance(error, BrokenPipeError):  # who closes a pipe early knows it
+        except OSError as error:  # mostly of standard output: a file that kpbench cannot write is a KpbenchError
+            if not isinstance(error, BrokenPipeError):  # the reader of the pipe closed it, and knows
                 click.echo(f"kpbench: {error.strerror or error}", err=True)
-            with contextlib.suppress(OSError, ValueError):  # or Python tries once more at its end, and exits with 120
+            with contextlib.suppress(OSError, ValueError):  # else Python writes again when it ends, and exits with 120
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
@@ -70,7 +69,9 @@ class LazyGroup(click.Group):
             sys.exit(130)
 
     def _translate(self, ctx: click.Context, problem: BaseException) -> str:
-        """Write a problem in the words of the command that met it."""
+        """Return the message of a problem in the words of the command that met it."""
+        from kpbench.cli.messages import name_options  # here, as it would slow down `kpbench --help`
+
         return name_options(str(problem), self.get_command(ctx, ctx.invoked_subcommand or ""))
 
 

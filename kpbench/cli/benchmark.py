@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.messages import print_warning
 from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
 
 
@@ -84,6 +85,6 @@ def bench(
     failed = [(run, failure) for run in runs for failure in run.failures]
     if failed:
         for run, (image_id, problem) in failed[:5]:
-            click.echo(f"kpbench: {run.scores.name} on {run.config.name}: image_id {image_id}: {problem}", err=True)
-        click.echo(f"kpbench: detectors failed on {len(failed)} images, which count as no detections", err=True)
+            print_warning(f"{run.scores.name} on {run.config.name}: image_id {image_id}: {problem}")
+        print_warning(f"detectors failed on {len(failed)} images, which count as no detections")
         raise SystemExit(1)

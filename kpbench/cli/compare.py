@@ -8,7 +8,8 @@ from typing import Any
 
 import click
 
-from kpbench.cli.score import FILE, print_warning, scoring_options
+from kpbench.cli.messages import print_warning
+from kpbench.cli.score import FILE, scoring_options
 
 
 @click.command()

@@ -37,6 +37,6 @@ def name_options(message: str, command: click.Command | None) -> str:
     return re.sub(r"""`(?:\w+\.)*(?P<field>\w+)(?:=["']?(?P<value>[^`]+?)["']?)?`""", translate, message)
 
 
-def warn(message: str) -> None:
-    """Print a line on stderr, in the words of the command that runs."""
+def print_warning(message: str) -> None:
+    """Print one line to stderr, in the words of the command that runs."""
     click.echo(f"kpbench: {name_options(message, click.get_current_context().command)}", err=True)

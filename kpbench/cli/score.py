@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from kpbench.cli.messages import print_warning
 from kpbench.cli.options import Finite
 
 
@@ -83,11 +84,6 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
     for option in reversed(options):
         command = option(command)
     return command
-
-
-def print_warning(message: str) -> None:
-    """Print one line to stderr."""
-    click.echo(f"kpbench: {message}", err=True)
 
 
 @click.command()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from kpbench.cli.messages import print_warning
 from kpbench.cli.options import BACKGROUNDS, PATCHES, SEED, SIZE, Two, run_options
 
 if TYPE_CHECKING:
@@ -167,9 +168,7 @@ def write_dataset(
         raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
     if run.broken:
         shown = ", ".join(run.broken[:5]) + (" …" if len(run.broken) > 5 else "")
-        click.echo(
-            f"kpbench: {len(run.broken)} background files could not be decoded and were passed over: {shown}", err=True
-        )
+        print_warning(f"{len(run.broken)} background files could not be decoded and were passed over: {shown}")
     print_dataset(run.dataset)
 
 
