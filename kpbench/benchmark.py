@@ -33,7 +33,7 @@ from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.report.figures import breakpoint_table, overview_table, paper_table
 from kpbench.report.paper import PAPER
 from kpbench.report.report import Report, write_report
-from kpbench.report.result_files import provenance, scores_file
+from kpbench.report.result_files import collect_provenance, encode_scores
 from kpbench.report.tables import Table
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
@@ -263,16 +263,16 @@ def write_suite_reports(
 
 def _write_suite_report(suite: str, runs: Sequence[Benched], out: Path, command: Sequence[str]) -> SuiteReport:
     dataset, scores = runs[0].dataset, tuple(run.scores for run in runs)
-    known = provenance(dataset.path, dataset.fingerprint, [run.predictions for run in runs], command)
+    provenance = collect_provenance(dataset.path, dataset.fingerprint, [run.predictions for run in runs], command)
     page = out / f"{suite}.html"
     for path in (page, page.with_suffix(".md")):
-        write_report(path, Report(scores, dataset.config, provenance=known, title=f"{suite}, simulated"))
+        write_report(path, Report(scores, dataset.config, provenance=provenance, title=f"{suite}, simulated"))
     folder = out / "scores" / suite
     folder.mkdir(parents=True, exist_ok=True)
     for run in runs:
-        known = provenance(run.dataset.path, run.dataset.fingerprint, [run.predictions], command)
+        provenance = collect_provenance(run.dataset.path, run.dataset.fingerprint, [run.predictions], command)
         name = f"{run.predictions.stem.rpartition('-')[0]}.json"
-        write_atomic(folder / name, scores_file(run.scores, known | {"config": run.dataset.config}))
+        write_atomic(folder / name, encode_scores(run.scores, provenance | {"config": run.dataset.config}))
     patches = [run.scores for run in runs if run.config.board is None]
     tables = [paper_table(patches, PAPER[name]) for run in patches[:1] for name in run.conditions if name in PAPER]
     return SuiteReport(suite, (overview_table(scores), *tables, breakpoint_table(scores)), page, folder)

@@ -16,8 +16,13 @@ from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import read_predictions
 from kpbench.report.figures import pose_table
 from kpbench.report.report import Report, require_report_suffix, write_report
-from kpbench.report.result_files import comparison_file, provenance, scores_csv, scores_file
-from kpbench.scoring.board_pose import PoseGroup, pose_errors, pose_groups
+from kpbench.report.result_files import (
+    collect_provenance,
+    encode_comparisons,
+    encode_scores,
+    encode_scores_csv,
+)
+from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pose_errors
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score
 from kpbench.types import Predictions, Truth, UInt8
@@ -163,14 +168,14 @@ def score_file(
     _refuse_overwrite([path], [to_json, to_csv], to_report)
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _pose_groups(scores, dataset) if pose else ()
-    known = provenance(dataset.path, dataset.fingerprint, [path], command)
+    provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
     if to_json:
-        write_atomic(to_json, scores_file(scores, known, poses))
+        write_atomic(to_json, encode_scores(scores, provenance, poses))
     if to_csv:
-        write_atomic(to_csv, scores_csv(scores, known))
+        write_atomic(to_csv, encode_scores_csv(scores, provenance))
     if to_report:
-        _write_report(to_report, [scores], dataset, known, warn, poses=poses)
-    return ScoredFile(scores, dataset, poses, known)
+        _write_report(to_report, [scores], dataset, provenance, warn, poses=poses)
+    return ScoredFile(scores, dataset, poses, provenance)
 
 
 def compare_files(
@@ -211,12 +216,12 @@ def compare_files(
     _refuse_overwrite(paths, [to_json], to_report)
     dataset, scores = _score_files(paths, truth, warn, options)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
-    known = provenance(dataset.path, dataset.fingerprint, paths, command)
+    provenance = collect_provenance(dataset.path, dataset.fingerprint, paths, command)
     if to_json:
-        write_atomic(to_json, comparison_file(comparisons, known))
+        write_atomic(to_json, encode_comparisons(comparisons, provenance))
     if to_report:
-        _write_report(to_report, scores, dataset, known, warn, comparisons)
-    return ComparedFiles(comparisons, tuple(scores), dataset, known)
+        _write_report(to_report, scores, dataset, provenance, warn, comparisons)
+    return ComparedFiles(comparisons, tuple(scores), dataset, provenance)
 
 
 def _as_path(file: str | Path | None) -> Path | None:
@@ -279,26 +284,26 @@ def _pose_groups(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ..
     view = board_in_view(dataset.config)
     if view is None:
         raise DataError(f"{dataset.path}: shows no known board, `pose=True` needs the dataset of a suite")
-    return pose_groups(scores, pose_errors(scores.tally, *view))
+    return group_pose_errors(scores, compute_pose_errors(scores.outcomes, *view))
 
 
 def _write_report(
     path: Path,
     runs: Sequence[Scores],
     dataset: LabelledImages,
-    known: Mapping[str, Any],
+    provenance: Mapping[str, Any],
     warn: Callable[[str], None],
     comparisons: Sequence[Comparison] = (),
     poses: Sequence[PoseGroup] = (),
 ) -> None:
-    from kpbench.report.worst_cases import Case, worst_cases  # here, because it loads OpenCV
+    from kpbench.report.worst_cases import Case, pick_worst_cases  # here, because it loads OpenCV
 
     cases: tuple[tuple[Case, ...], ...] = ()
     if path.suffix.lower() == ".html":
         try:
-            cases = tuple(worst_cases(run.tally, dataset.image, MOST_CASES // len(runs) or 1) for run in runs)
+            cases = tuple(pick_worst_cases(run.outcomes, dataset.image, MOST_CASES // len(runs) or 1) for run in runs)
         except DataError as error:
             warn(f"{path} shows no images: {error}")
     title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
     tables = (pose_table(runs[0], poses),) if poses else ()
-    write_report(path, Report(tuple(runs), dataset.config, cases, known, tuple(comparisons), tables, title))
+    write_report(path, Report(tuple(runs), dataset.config, cases, provenance, tuple(comparisons), tables, title))

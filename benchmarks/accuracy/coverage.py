@@ -13,12 +13,11 @@ import argparse
 
 import numpy as np
 
-from kpbench.scoring.bootstrap import intervals
-from kpbench.scoring.metrics import SUMS, ratios
+from kpbench.scoring import SUMS, bootstrap_intervals, compute_ratios
 
 IMAGES, KEYPOINTS = 8, 6  # of a scene; of an image
 REGIMES = {"good": (18.0, 2.0), "middling": (3.0, 2.0), "poor": (1.0, 4.0)}  # Beta distribution of the quality
-METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "precision", "f1")
+CHECKED_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "precision", "f1")
 
 
 def experiment(rng: np.random.Generator, scenes: int, quality: tuple[float, float]) -> np.ndarray:
@@ -55,11 +54,11 @@ def coverage(scenes: int, regime: str, experiments: int, resamples: int = 1000, 
     """Share of experiments whose interval holds the true value, for each metric."""
     rng = np.random.default_rng(seed)
     truth = true_values(REGIMES[regime])
-    held = dict.fromkeys(METRICS, 0)
+    held = dict.fromkeys(CHECKED_METRICS, 0)
     for n in range(experiments):
         sums = experiment(rng, scenes, REGIMES[regime])
-        found = intervals(sums, lambda s: ratios(s, "one-to-one"), resamples, seed=n)
-        for name in METRICS:
+        found = bootstrap_intervals(sums, lambda s: compute_ratios(s, "one-to-one"), resamples, seed=n)
+        for name in CHECKED_METRICS:
             both = found[name]
             held[name] += both is not None and both[0] <= truth[name] <= both[1]
     return {name: count / experiments for name, count in held.items()}
@@ -70,7 +69,7 @@ def main() -> None:
     parser.add_argument("--experiments", type=int, default=1000)
     parser.add_argument("--scenes", type=int, nargs="*", default=[20, 50, 100, 500])
     args = parser.parse_args()
-    print(f"{'scenes':>6} {'regime':<10}" + "".join(f"{name:>22}" for name in METRICS))
+    print(f"{'scenes':>6} {'regime':<10}" + "".join(f"{name:>22}" for name in CHECKED_METRICS))
     for scenes in args.scenes:
         for regime in REGIMES:
             shares = coverage(scenes, regime, args.experiments)

@@ -17,16 +17,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from kpbench.report.charts import COLOURS, STYLE, Series, line_chart
-from kpbench.report.paper import PAPER
-from kpbench.report.tables import Cell, Estimate, Table, to_markdown
-from kpbench.scoring.metrics import LABELS
+from kpbench.report import (
+    CHART_COLOURS,
+    CHART_STYLE,
+    PAPER,
+    Cell,
+    Estimate,
+    Series,
+    Table,
+    line_chart,
+    to_markdown,
+)
+from kpbench.scoring import LABELS
 
 ROOT = Path(__file__).parents[2]
 RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"
 PAGE, FIGURE = ROOT / "docs" / "results" / "leaderboard.md", ROOT / "docs" / "results" / "severity.svg"
 ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
-METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
+SHOWN_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
 QUICK_PX = (640, 480)
 """The size of `kpbench bench --quick`."""
@@ -94,8 +102,8 @@ def overall(runs: list[dict[str, Any]]) -> Table:
         board = run["provenance"]["config"].get("board", {"name": "patches"})["name"]
         images = run["metrics"]["counts"]["images"]
         about = (run["detector"]["name"], run["detector"]["version"], board, images)
-        rows.append((*about, *(estimate(run["metrics"], name) for name in METRICS)))
-    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in METRICS))
+        rows.append((*about, *(estimate(run["metrics"], name) for name in SHOWN_METRICS)))
+    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in SHOWN_METRICS))
     return Table("All conditions", columns, tuple(rows))
 
 
@@ -159,7 +167,7 @@ def figure(runs: list[dict[str, Any]]) -> str:
     names = [*((n + (n >= PAPER_STYLE), run["detector"]["name"]) for n, run in enumerate(runs))]
     names.append((PAPER_STYLE, "the paper, photographs (dashed); all others: simulated"))
     legend = "".join(
-        f'<circle class="s{style % COLOURS}" cx="60" cy="{30 + 26 * row}" r="6"/>'
+        f'<circle class="s{style % CHART_COLOURS}" cx="60" cy="{30 + 26 * row}" r="6"/>'
         f'<text x="78" y="{34 + 26 * row}">{name}</text>'
         for row, (style, name) in enumerate(names)
     )
@@ -173,7 +181,7 @@ def figure(runs: list[dict[str, Any]]) -> str:
     about = "Detection score over severity, simulated, beside the paper's photographs"
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{about}" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}"><style>{own}{STYLE}</style>{cells}</svg>\n'
+        f'width="{width}" height="{height}"><style>{own}{CHART_STYLE}</style>{cells}</svg>\n'
     )
 
 

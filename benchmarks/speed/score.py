@@ -24,11 +24,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from kpbench.predictions.coco import open_coco
-from kpbench.predictions.files import Predictions, read_predictions, write_predictions
-from kpbench.scoring.outcomes import Settings, tally
-from kpbench.scoring.scores import evaluate, summarise
-from kpbench.types import KEYPOINT_DTYPE, Truth
+from kpbench import KEYPOINT_DTYPE, Predictions, Truth, read_predictions, score, write_predictions
+from kpbench.predictions import open_coco
+from kpbench.scoring import Settings, compute_scores, match_predictions
 
 KEYPOINTS, CONDITIONS, RUNGS = 5, 5, 4
 LANE_PX = 640 / KEYPOINTS  # each keypoint of an image has its own, so none are within reach of one detection
@@ -93,11 +91,11 @@ def growth(n: int) -> None:
     truth, predictions = tables(n, np.random.default_rng(0))
     before = peak_mb()
     times = [cpu_s()]
-    matched = tally(truth, predictions, Settings(resamples=0))
+    outcomes = match_predictions(truth, predictions, Settings(resamples=0))
     times.append(cpu_s())
-    summarise(matched)
+    compute_scores(outcomes)
     times.append(cpu_s())
-    scores = evaluate(truth, predictions)
+    scores = score(truth, predictions)
     times.append(cpu_s())
     matching, metrics, whole = np.diff(times)
     print(
@@ -159,9 +157,9 @@ def rival(name: str, folder: Path) -> None:
     if name == "kpbench":
         dataset, predictions = open_coco(truth), read_predictions(results)
         times.append(cpu_s())
-        rows = tally(dataset.truth, predictions, Settings(resamples=0), allow_missing=True)
+        outcomes = match_predictions(dataset.truth, predictions, Settings(resamples=0), allow_missing=True)
         times.append(cpu_s())
-        recall = summarise(rows)["recall"]
+        recall = compute_scores(outcomes)["recall"]
     else:
         with contextlib.redirect_stdout(io.StringIO()):
             coco = module.COCO(truth)

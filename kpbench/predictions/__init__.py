@@ -1,1 +1,5 @@
-"""Predictions files in and out."""
+"""Read and write predictions files in every format, and COCO annotations as truth."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Single tables and charts of the scores of one or several detectors; a report is made of them."""
+"""Make single tables and charts of the scores of one or several detectors. A report consists of them."""
 
 from __future__ import annotations
 
@@ -9,21 +9,36 @@ from kpbench.report.charts import Series, bar_chart, line_chart
 from kpbench.report.paper import PAPER, SYNTHETIC, PaperTable, paper_value
 from kpbench.report.tables import Cell, Estimate, Table
 from kpbench.scoring.board_pose import PoseGroup
-from kpbench.scoring.breakpoints import LIMIT, Breakpoint, breakpoints
-from kpbench.scoring.comparison import METRICS as COMPARED
-from kpbench.scoring.comparison import Comparison
+from kpbench.scoring.breakpoints import DETECTION_SCORE_LIMIT, Breakpoint, find_breakpoints
+from kpbench.scoring.comparison import COMPARED_METRICS, Comparison
 from kpbench.scoring.groups import Group
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
 
-DIFFERENCES = len(COMPARED)
-PAPER_STYLE = 7  # grey
-SHORT = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
+PAPER_STYLE = 7
+"""Number of the colour of the paper's lines: grey."""
+SHORT_LABELS = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
+"""The paper's metrics in narrow columns."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A chart with what it shows; ``legend`` lists (name, style) of its series."""
+    """A chart with its caption and legend.
+
+    Attributes
+    ----------
+    caption : str
+    svg : str
+        The chart, an ``<svg>`` element.
+    legend : tuple of (name, style)
+        Name and number of the colour of each series.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.report.Figure("Nothing", "<svg></svg>").legend
+    ()
+    """
 
     caption: str
     svg: str
@@ -34,26 +49,54 @@ class Figure:
 
 
 def estimate(group: Group | None, metric: str) -> Estimate | None:
-    """A metric of a group with its interval; None where there is no such group."""
+    """Return a metric of a group with its interval; None for a group of None."""
     return None if group is None else Estimate(group.metrics[metric], group.intervals.get(metric))
 
 
 def overview_table(runs: Sequence[Scores]) -> Table:
-    """A row a detector: the headline metrics over all images; a note tells who failed on some."""
+    """Tabulate the main metrics over all images, one row per detector.
+
+    The note names the detectors that raised an error on some images.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> table = kpbench.report.overview_table([scores])
+    >>> table.columns[:2], table.rows[0][0]
+    (('detector', 'detection score'), 'oracle')
+    """
     metrics = (*PAPER_METRICS, "precision", "f1", "average_precision", "error_median_px", "error_p95_px")
     rows = [(run.name, *(estimate(run.overall, metric) for metric in metrics)) for run in runs]
-    failed = [f"{run.name} failed on {len(said)} images" for run in runs if (said := run.detector.get("failures"))]
+    failed = [f"{run.name} failed on {len(f)} images" for run in runs if (f := run.detector.get("failures"))]
     note = f"{', '.join(failed)}, which count as no detections." if failed else ""
     return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows), note)
 
 
 def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simulated") -> Table:
-    """A table of the paper with our runs below its rows, a column a rung; ours have ``images``."""
+    """Set detectors below the rows of one of the paper's tables, with one column per rung.
+
+    Parameters
+    ----------
+    runs : sequence of Scores
+    table : PaperTable
+        One of :data:`kpbench.report.PAPER`.
+    images : str
+        How the images of the detectors were made; it stands beside their rows.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> table = kpbench.report.paper_table([scores], kpbench.report.PAPER["blur"])
+    >>> table.columns[3:], table.rows[0][:4]
+    (('3 px', '7 px', '11 px', '15 px'), ('detection', 'paper', 'photographs', 1.0))
+    """
     ours = sorted({r for run in runs for r in run.conditions.get(table.condition, ())})
     rungs = sorted({*table.rungs, *ours})
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
-        label = SHORT[metric]
+        label = SHORT_LABELS[metric]
         theirs = [paper_value(table.condition, rung, metric) for rung in rungs]
         rows.append((label, "paper", table.images, *(None if v is None else float(v) for v in theirs)))
         for run in runs:
@@ -71,21 +114,21 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
 
 
 def _difference(ours: Estimate | None, theirs: float | None) -> Estimate | None:
-    """Ours less the paper's, whose own spread nobody knows: the interval is ours, moved."""
+    """Return our value less the paper's. The paper gives no intervals, so the interval is that of our value."""
     if ours is None or ours.value is None or theirs is None:
         return None
-    between = None if ours.interval is None else (ours.interval[0] - theirs, ours.interval[1] - theirs)
-    return Estimate(ours.value - theirs, between)
+    interval = None if ours.interval is None else (ours.interval[0] - theirs, ours.interval[1] - theirs)
+    return Estimate(ours.value - theirs, interval)
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
-    """The paper's table 2 with our runs below its rows; ours fill the column of ``deteriorate``."""
+    """Set detectors below the rows of the paper's table 2, in the column of ``deteriorate`` ("none" or "paper")."""
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
-        rows.append((SHORT[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
+        rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
         for run in runs:
             cells = (estimate(run.overall, metric) if k == deteriorate else None for k in SYNTHETIC)
-            rows.append((SHORT[metric], run.name, "simulated", *cells))
+            rows.append((SHORT_LABELS[metric], run.name, "simulated", *cells))
     return Table(
         "Synthetic validation set (paper: its own simulation; ours: simulated)",
         ("metric", "detector", "images", "without deterioration", "with deterioration"),
@@ -95,25 +138,34 @@ def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
 
 
 def condition_table(runs: Sequence[Scores], condition: str) -> Table:
-    """The paper's three metrics for a condition that the paper does not have."""
+    """Tabulate the paper's three metrics over the rungs of a condition that the paper does not have."""
     rungs = sorted({r for run in runs for r in run.conditions.get(condition, ())})
     rows = [
-        (SHORT[metric], run.name, *(estimate(run.group(condition, r), metric) for r in rungs))
+        (SHORT_LABELS[metric], run.name, *(estimate(run.group(condition, r), metric) for r in rungs))
         for metric in PAPER_METRICS
         for run in runs
     ]
     return Table(condition, ("metric", "detector", *(f"{r:g}" for r in rungs)), tuple(rows))
 
 
-def breakpoint_table(runs: Sequence[Scores], limit: float = LIMIT) -> Table:
-    """A row a detector, a column a condition: the rung at which the detection score crosses ``limit``."""
+def breakpoint_table(runs: Sequence[Scores], limit: float = DETECTION_SCORE_LIMIT) -> Table:
+    """Tabulate the rungs at which the detection score crosses a limit: a row per detector, a column per condition.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.breakpoint_table([scores]).title
+    'Where the detection score crosses 0.9'
+    """
     found = [
-        {name: [b for b in breakpoints(run, limit) if b.condition == name] for name in run.conditions} for run in runs
+        {name: [b for b in find_breakpoints(run, limit) if b.condition == name] for name in run.conditions}
+        for run in runs
     ]
-    names = list(dict.fromkeys(name for by in found for name in by))
+    names = list(dict.fromkeys(name for of_run in found for name in of_run))
     rows = [
-        (run.name, *("; ".join(map(_crossing, by.get(name, []))) or None for name in names))
-        for run, by in zip(runs, found, strict=True)
+        (run.name, *("; ".join(map(_describe_crossing, of_run.get(name, []))) or None for name in names))
+        for run, of_run in zip(runs, found, strict=True)
     ]
     return Table(
         f"Where the detection score crosses {limit:g}",
@@ -123,11 +175,11 @@ def breakpoint_table(runs: Sequence[Scores], limit: float = LIMIT) -> Table:
     )
 
 
-def _crossing(b: Breakpoint) -> str:
+def _describe_crossing(b: Breakpoint) -> str:
     if b.rung is None:
         return f"{b.crossing} everywhere"
-    spread = f" [{b.interval[0]:.3g}, {b.interval[1]:.3g}]" if b.interval else ""
-    return f"{b.crossing} at {b.rung:.3g}{spread}"
+    interval = f" [{b.interval[0]:.3g}, {b.interval[1]:.3g}]" if b.interval else ""
+    return f"{b.crossing} at {b.rung:.3g}{interval}"
 
 
 def group_table(
@@ -136,14 +188,34 @@ def group_table(
     patches: Mapping[int, str] | None = None,
     errors: Sequence[str] = ("error_median_px", "error_p95_px", "error_median_radii"),
 ) -> Table:
-    """A row a group: what it is of, and the main metrics; the readings as printed where any differs."""
+    """Tabulate the main metrics of groups, one row per group.
+
+    The columns of condition, rung, patch and radius stand where a group has any. The paper's formulas as printed
+    stand where they differ from the one-to-one metrics in a group.
+
+    Parameters
+    ----------
+    groups : sequence of Group
+    title : str
+    patches : mapping of int to str, optional
+        Names of the patches by ID.
+    errors : sequence of str
+        Names of the localisation errors to tabulate.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.group_table(scores.by, "All groups").columns[:3]
+    ('patch', 'radius (px)', 'images')
+    """
     printed = [f"{m}_literal" for m in PAPER_METRICS if any(g.metrics[m] != g.metrics[f"{m}_literal"] for g in groups)]
     metrics = (*PAPER_METRICS, *printed, *errors)
     keys: dict[str, list[Cell]] = {
         "condition": [g.condition for g in groups],
         "rung": [None if g.rung is None else f"{g.rung:g}" for g in groups],
         "patch": [g.patch_id if g.patch_id is None else (patches or {}).get(g.patch_id, g.patch_id) for g in groups],
-        "radius (px)": [g.key.radius_px and _span(*g.key.radius_px) for g in groups],
+        "radius (px)": [g.key.radius_px and _describe_radii(*g.key.radius_px) for g in groups],
     }
     keys = {
         name: ["all" if v is None else v for v in values]
@@ -162,12 +234,12 @@ def group_table(
     return Table(title, (*keys, "images", "keypoints", *(LABELS[m] for m in metrics)), rows)
 
 
-def _span(low: float, high: float | None) -> str:
+def _describe_radii(low: float, high: float | None) -> str:
     return f"over {low:g}" if high is None else f"{low:g} to {high:g}"
 
 
 def count_table(runs: Sequence[Scores]) -> Table:
-    """The error taxonomy by counts, a row a detector."""
+    """Tabulate the outcomes of true keypoints and detections, one row per detector."""
     names = ("truths", "matched", "wrong_id", "missed", "detections", "duplicate", "near_miss", "clutter")
     titles = (
         "keypoints",
@@ -184,21 +256,29 @@ def count_table(runs: Sequence[Scores]) -> Table:
 
 
 def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
-    """True IDs of matched detections in rows, detected ones in columns."""
+    """Tabulate the identities of matched detections: true IDs in rows, detected IDs in columns."""
     names = [str(patches.get(i, i)) for i in run.confusion["ids"]]
     rows = tuple((name, *cells) for name, cells in zip(names, run.confusion["matrix"], strict=True))
     return Table(f"IDs of matched detections: {run.name}", ("true", *names, "other"), rows, shade=True)
 
 
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:
-    """Wins and losses of the first detector: a row a rival and metric, counted over the conditions' rungs."""
+    """Tabulate the differences over all images and the verdicts over the rungs: a row per rival and metric.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.verdict_table([kpbench.compare(scores, scores)]).rows[0][:2]
+    ('oracle', 'detection score')
+    """
     rows: list[tuple[Cell, ...]] = []
     for c in comparisons:
-        for d in c.differences[:DIFFERENCES]:
+        for d in c.differences[: len(COMPARED_METRICS)]:
             n = c.verdicts(d.metric)
-            whole = Estimate(d.value, d.interval)
-            wins = (n["better"], n["even"], n["worse"])
-            rows.append((c.second, LABELS[d.metric], d.first, d.second, whole, d.verdict, *wins))
+            overall = Estimate(d.value, d.interval)
+            counts = (n["better"], n["even"], n["worse"])
+            rows.append((c.second, LABELS[d.metric], d.first, d.second, overall, d.verdict, *counts))
     name = comparisons[0].first
     columns = ("against", "metric", name, "the other", "difference", "over all images", "rungs better", "even", "worse")
     note = (
@@ -209,26 +289,49 @@ def verdict_table(comparisons: Sequence[Comparison]) -> Table:
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """First minus second: a row a condition and rung, the first over all images."""
-    at: dict[tuple[str, str], list[Cell]] = {}
+    """Tabulate first minus second: all images, then a row per condition and rung.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.difference_table(kpbench.compare(scores, scores)).rows[0][:2]
+    ('all', 'all')
+    """
+    cells_of: dict[tuple[str, str], list[Cell]] = {}
     for d in comparison.differences:
         key = ("all", "all") if d.condition is None else (d.condition, f"{d.rung:g}")
-        at.setdefault(key, []).append(Estimate(d.value, d.interval))
-    names = [LABELS[d.metric] for d in comparison.differences[:DIFFERENCES]]
+        cells_of.setdefault(key, []).append(Estimate(d.value, d.interval))
+    names = [LABELS[d.metric] for d in comparison.differences[: len(COMPARED_METRICS)]]
     title = f"{comparison.first} minus {comparison.second}"
-    return Table(title, ("condition", "rung", *names), tuple((*key, *cells) for key, cells in at.items()))
+    return Table(title, ("condition", "rung", *names), tuple((*key, *cells) for key, cells in cells_of.items()))
 
 
 def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
-    """Errors of the board's pose: a row for all images and for each condition and rung."""
+    """Tabulate errors of the board's pose: all images, then a row per condition and rung.
+
+    Parameters
+    ----------
+    run : Scores
+    groups : sequence of PoseGroup
+        The result of :func:`kpbench.scoring.group_pose_errors`.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> group = kpbench.scoring.PoseGroup(None, None, 6, 6, 0.1, 0.4, 0.3, 1.2)
+    >>> kpbench.report.pose_table(scores, [group]).rows[0][:4]
+    ('all', 'all', 6, 6)
+    """
     rows = []
     for group in groups:
         _, _, *cells = astuple(group)
         rung = "all" if group.rung is None else f"{group.rung:g}"
         rows.append((group.condition or "all", rung, *cells))
-    spread = ("median", "95th percentile")
-    errors_of = [f"{what}, {part}" for what in ("translation (%)", "rotation (°)") for part in spread]
-    columns = ("condition", "rung", "images", "with a pose", *errors_of)
+    percentiles = ("median", "95th percentile")
+    errors = [f"{error}, {percentile}" for error in ("translation (%)", "rotation (°)") for percentile in percentiles]
+    columns = ("condition", "rung", "images", "with a pose", *errors)
     note = "From at least four matched keypoints an image; translation in % of the distance of board and camera."
     return Table(f"Pose of the board: {run.name}", columns, tuple(rows), note)
 
@@ -237,12 +340,27 @@ def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
 
 
 def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detection_score") -> Figure:
-    """A metric over the rungs of a condition, a line a detector with its 95 % band, and the paper's numbers dashed."""
+    """Draw a metric over the rungs of a condition: a line per detector with its 95 % band, the paper's line dashed.
+
+    Parameters
+    ----------
+    runs : sequence of Scores
+    condition : str
+    metric : str
+        One of :data:`kpbench.scoring.METRICS`.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.severity_chart([scores], "blur").caption
+    'blur: detection score'
+    """
     series = []
     for n, run in enumerate(runs):
         rungs = run.conditions.get(condition, [])
-        at = [estimate(run.group(condition, r), metric) or Estimate(None) for r in rungs]
-        series.append(Series(run.name, rungs, [e.value for e in at], [e.interval for e in at], n))
+        found = [estimate(run.group(condition, r), metric) or Estimate(None) for r in rungs]
+        series.append(Series(run.name, rungs, [e.value for e in found], [e.interval for e in found], n))
     paper = PAPER.get(condition)
     if paper:
         values = [paper_value(condition, r, metric) for r in paper.rungs]
@@ -262,7 +380,7 @@ def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detect
 
 
 def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
-    """Precision over recall as the threshold on the score falls."""
+    """Draw precision over recall at all thresholds on the score."""
     series = []
     for n, run in enumerate(runs):
         recall = [0.0 if r is None else r for r in run.curve["recall"]]
@@ -274,7 +392,7 @@ def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
 
 
 def eps_chart(runs: Sequence[Scores]) -> Figure:
-    """Detection score over the reach of a match; the one that was used is not special here."""
+    """Draw the detection score over the largest distance of a match, ε."""
     series = [
         Series(run.name, [e or 0.0 for e in run.eps_curve["eps"]], run.eps_curve["detection_score"], style=n)
         for n, run in enumerate(runs)
@@ -286,13 +404,13 @@ def eps_chart(runs: Sequence[Scores]) -> Figure:
 
 
 def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
-    """A metric over the radius of the true keypoints' discs; each bin is drawn at the middle of its edges."""
+    """Draw a metric over the radius of the true keypoints' discs. The point of a bin is midway between its edges."""
     series = []
     for n, run in enumerate(runs):
         bins = [(g, *g.key.radius_px) for g in run.by if g.key.radius_px is not None]
-        middle = [(low + (high or 2 * low)) / 2 for _, low, high in bins]
-        at = [Estimate(g.metrics[metric], g.intervals.get(metric)) for g, _, _ in bins]
-        series.append(Series(run.name, middle, [e.value for e in at], [e.interval for e in at], n))
+        middles = [(low + (high or 2 * low)) / 2 for _, low, high in bins]
+        found = [Estimate(g.metrics[metric], g.intervals.get(metric)) for g, _, _ in bins]
+        series.append(Series(run.name, middles, [e.value for e in found], [e.interval for e in found], n))
     ticks = sorted({x for s in series for x in s.x})
     svg = line_chart(
         series,
@@ -306,7 +424,7 @@ def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
 
 
 def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:
-    """Shares of what became of the true keypoints, and of the detections: a bar a detector."""
+    """Draw the shares of the outcomes of true keypoints, and of detections: a bar per detector."""
     keypoints: tuple[str, ...] = ("found with the right ID", "found with a wrong ID", "missed")
     if any(run.overall.counts["id_correct"] is None for run in runs):
         keypoints = ("found", "missed")

@@ -1,6 +1,6 @@
-"""The tables of the paper (arXiv:2410.00521) as data, to be set beside ours.
+"""The numbers of the paper's tables (arXiv:2410.00521).
 
-Its suite was photographed, ours is simulated; every table that shows both says so in its header.
+The paper's suite was photographed, kpbench's is simulated. Every table that shows both says so in its header.
 """
 
 from __future__ import annotations
@@ -14,9 +14,28 @@ Row = tuple[float, ...]
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One experiment: a value a rung for each of the paper's three metrics.
+    """One experiment of the paper: a value per rung for each of the three metrics.
 
-    ``condition`` and ``rungs`` are those of the suite ``paper-v1``; ``images`` says how the paper's images were made.
+    Attributes
+    ----------
+    number : int
+        Number of the table in the paper.
+    condition : str
+        Name of the same condition in the suite ``paper-v1``.
+    title, unit : str
+        Name and unit of the rungs.
+    rungs : tuple of float
+    detection_score, id_matching_score, average_false_alarm : tuple of float
+        One value per rung.
+    images : str
+        How the paper's images were made.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> table = kpbench.report.PAPER["blur"]
+    >>> table.rungs, table.detection_score
+    ((3, 7, 11, 15), (1, 0.986, 0.882, 0.605))
     """
 
     number: int
@@ -85,19 +104,26 @@ PAPER = {
         ),
     )
 }
-"""Tables 3 to 7 by condition."""
+"""The paper's tables 3 to 7, by condition."""
 
 SYNTHETIC = {
     "none": dict(zip(PAPER_METRICS, (0.985, 0.999, 0.379), strict=True)),
     "paper": dict(zip(PAPER_METRICS, (0.950, 0.993, 0.727), strict=True)),
 }
-"""Table 2, the synthetic validation set, by ``kpbench synth --deteriorate``: without and with deterioration."""
-SYNTHETIC_PX = (5.0, 80.0)
-"""Least and largest radius, px, of the sets that are set beside it: ``kpbench synth`` as it is."""
+"""The paper's table 2, the synthetic validation set, by the field `deteriorate` of :class:`kpbench.SynthConfig`."""
+SYNTHETIC_RADIUS_PX = (5.0, 80.0)
+"""Smallest and largest radius, px, of the synthetic sets that are comparable with table 2: the defaults."""
 
 
 def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:
-    """What the paper reports, or None where it does not."""
+    """Return a number of the paper's tables 3 to 7, or None if they do not have it.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.report.paper_value("blur", 15, "detection_score")
+    0.605
+    """
     table = PAPER.get(condition or "")
     if table is None or rung not in table.rungs or metric not in PAPER_METRICS:
         return None

@@ -1,20 +1,20 @@
-"""Scores of one or several detectors on one dataset as a report: HTML in one offline file, Markdown, LaTeX.
+"""Report the scores of one or several detectors on one dataset: HTML in one offline file, Markdown, LaTeX.
 
-:func:`sections` says what is in a report; each writer only says how it looks.
+:func:`make_sections` makes the content of a report. A function per form renders the content.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.report.charts import STYLE
+from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
 from kpbench.report.figures import (
     Figure,
     breakpoint_table,
@@ -33,7 +33,7 @@ from kpbench.report.figures import (
     taxonomy_charts,
     verdict_table,
 )
-from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_PX
+from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
@@ -44,23 +44,31 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Report:
-    """What a report is made of.
+    """The content of a report.
 
     Attributes
     ----------
     runs : tuple of Scores
-        One or more detectors on the same truth.
+        Scores of one or more detectors on the same truth.
     config : mapping
-        The dataset's, which says how its images were made and what the patches are called; may be empty.
+        The dataset's config: how the images were made, and the names of the patches. May be empty.
     cases : tuple of tuples of Case
-        For each run the images to show; may be empty.
+        The images to show for each run; may be empty.
     provenance : mapping
         Versions, command, fingerprints.
     comparisons : tuple of Comparison
-        Of the first run with others; may be empty.
+        Comparisons of the first run with others; may be empty.
     poses : tuple of Table
-        Of :func:`kpbench.report.pose_table`; may be empty.
+        Results of :func:`kpbench.report.pose_table`; may be empty.
     title : str
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> dataset = kpbench.open_dataset("kpbench-data")
+    >>> scores = kpbench.score(dataset, kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.Report((scores,), dataset.config).images
+    'simulated'
     """
 
     runs: tuple[Scores, ...]
@@ -73,154 +81,186 @@ class Report:
 
     @property
     def images(self) -> str:
-        """How the images were made: "simulated", or "" where the dataset does not say."""
+        """How the images were made: "simulated", or "" if the config does not tell."""
         return "simulated" if self.config.get("kind") in ("suite", "synth") else ""
 
     @property
     def patch_names(self) -> dict[int, str]:
-        """Names of the patches by ID, where the dataset tells them."""
+        """Names of the patches by ID, as far as the config has them."""
         return {int(patch["id"]): str(patch["name"]) for patch in self.config.get("patches", ())}
 
 
 @dataclass(frozen=True)
 class Gallery:
-    """Pictures of one detector's failures."""
+    """Pictures of a detector's failures."""
 
     name: str
     cases: tuple[Case, ...]
 
 
+Block = Table | Figure | Gallery
+"""A part of a section."""
+
+
 @dataclass(frozen=True)
 class Section:
-    """A headline, a sentence or two, and tables, figures and pictures."""
+    """A part of a report: a title, a sentence or two, and tables, figures or pictures."""
 
     title: str
     lead: str
-    blocks: tuple[Table | Figure | Gallery, ...]
+    blocks: tuple[Block, ...]
 
 
-def sections(report: Report) -> Iterator[Section]:
-    """Everything in a report, in order."""
-    runs, patches = report.runs, report.patch_names
-    settings = runs[0].settings
-    yield Section(
+def make_sections(report: Report) -> list[Section]:
+    """Make the sections of a report, in order. A section without content is left out."""
+    makers = (
+        _overview,
+        _compared,
+        _beside_the_paper,
+        _severity,
+        _precision_and_recall,
+        _localisation,
+        _pose,
+        _identities,
+        _worst_cases,
+        _all_groups,
+    )
+    return [section for make in makers for section in [make(report)] if section.blocks]
+
+
+def _overview(report: Report) -> Section:
+    runs, settings = report.runs, report.runs[0].settings
+    return Section(
         "Overview",
         f"A detection matches a keypoint at most {settings.eps:g} of its {settings.eps_radius} radius away "
         f"({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
         (overview_table(runs), count_table(runs), *taxonomy_charts(runs)),
     )
-    if report.comparisons:
-        yield Section(
-            "Compared",
-            "Differences are paired: the same scenes are resampled for both.",
-            (verdict_table(report.comparisons), *map(difference_table, report.comparisons)),
-        )
-    conditions = list(dict.fromkeys(name for run in runs for name in run.conditions))
-    known = [PAPER[name] for name in conditions if name in PAPER]
+
+
+def _compared(report: Report) -> Section:
+    comparisons = report.comparisons
+    tables = [verdict_table(comparisons), *map(difference_table, comparisons)] if comparisons else []
+    return Section("Compared", "Differences are paired: the same scenes are resampled for both.", tuple(tables))
+
+
+def _beside_the_paper(report: Report) -> Section:
+    known = [PAPER[name] for name in _conditions(report) if name in PAPER]
+    tables = [paper_table(report.runs, table, report.images or "the user's") for table in known]
     deteriorate, limits = str(report.config.get("deteriorate")), report.config.get("limits", {})
-    like_the_papers = deteriorate in SYNTHETIC and tuple(limits.get("radius_px", SYNTHETIC_PX)) == SYNTHETIC_PX
-    if known or like_the_papers:
-        tables = [paper_table(runs, table, report.images or "the user's") for table in known]
-        if like_the_papers:
-            tables.append(synthetic_table(runs, deteriorate))
-        yield Section(
-            "Beside the paper",
-            "The paper's photographs are not public. Its numbers and ours are from different images and different "
-            "prints, so they may be compared in shape, not digit by digit.",
-            tuple(tables),
-        )
-    if conditions:
-        charts = [
-            severity_chart(runs, name, metric)
-            for name in conditions
-            for metric in ("detection_score", "average_false_alarm")
-        ]
-        others = [condition_table(runs, name) for name in conditions if name not in PAPER]
-        yield Section(
-            "Severity",
-            "Each condition from rung to rung, all patches together.",
-            (breakpoint_table(runs), *charts, *others),
-        )
-    yield Section(
+    radius_px = tuple(limits.get("radius_px", SYNTHETIC_RADIUS_PX))
+    if deteriorate in SYNTHETIC and radius_px == SYNTHETIC_RADIUS_PX:
+        tables.append(synthetic_table(report.runs, deteriorate))
+    return Section(
+        "Beside the paper",
+        "The paper's photographs are not public. Its numbers and ours are from different images and different "
+        "prints, so they may be compared in shape, not digit by digit.",
+        tuple(tables),
+    )
+
+
+def _severity(report: Report) -> Section:
+    runs, conditions = report.runs, _conditions(report)
+    metrics = ("detection_score", "average_false_alarm")
+    charts = [severity_chart(runs, name, metric) for name in conditions for metric in metrics]
+    others = [condition_table(runs, name) for name in conditions if name not in PAPER]
+    blocks: list[Block] = [breakpoint_table(runs), *charts, *others] if conditions else []
+    return Section("Severity", "Each condition from rung to rung, all patches together.", tuple(blocks))
+
+
+def _precision_and_recall(report: Report) -> Section:
+    return Section(
         "Precision and recall",
         "Which detections to keep, from the surest only to all; and how near a detection must come.",
-        (precision_recall_chart(runs), eps_chart(runs)),
+        (precision_recall_chart(report.runs), eps_chart(report.runs)),
     )
-    sized = [g for g in runs[0].by if g.key.radius_px is not None]
-    if sized:
-        tables = [
-            group_table([g for g in run.by if g.key.radius_px is not None], f"By radius: {run.name}") for run in runs
-        ]
-        yield Section(
-            "Localisation by radius",
-            "Errors are of matches only, so they cannot exceed the reach of a match.",
-            (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"), *tables),
-        )
-    if report.poses:
-        yield Section("Pose", "The board's pose from the matched detections, by solvePnP.", report.poses)
-    if any(run.confusion for run in runs):
-        yield Section(
-            "Identities",
-            "Matched detections: true ID in rows, detected ID in columns; other is an ID that no true keypoint has.",
-            tuple(confusion_table(run, patches) for run in runs if run.confusion),
-        )
-    if report.cases:
-        yield Section(
-            "Worst cases",
-            "The images with most failures, shared out among the conditions. Ellipses are true keypoints, crosses are "
-            "detections, numbers are IDs.",
-            tuple(Gallery(run.name, cases) for run, cases in zip(runs, report.cases, strict=True)),
-        )
-    listed = [(run, [g for g in run.by if g.key.radius_px is None]) for run in runs]
-    if any(groups for _, groups in listed):
-        yield Section(
-            "All groups",
-            "Everything by condition, rung and patch.",
-            tuple(group_table(groups, run.name, patches) for run, groups in listed if groups),
-        )
+
+
+def _localisation(report: Report) -> Section:
+    runs = report.runs
+    bins = [(run, [g for g in run.by if g.key.radius_px is not None]) for run in runs]
+    blocks: tuple[Block, ...] = ()
+    if bins[0][1]:
+        charts = (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"))
+        blocks = (*charts, *(group_table(groups, f"By radius: {run.name}") for run, groups in bins))
+    lead = "Errors are of matches only, so they cannot exceed the reach of a match."
+    return Section("Localisation by radius", lead, blocks)
+
+
+def _pose(report: Report) -> Section:
+    return Section("Pose", "The board's pose from the matched detections, by solvePnP.", report.poses)
+
+
+def _identities(report: Report) -> Section:
+    return Section(
+        "Identities",
+        "Matched detections: true ID in rows, detected ID in columns; other is an ID that no true keypoint has.",
+        tuple(confusion_table(run, report.patch_names) for run in report.runs if run.confusion),
+    )
+
+
+def _worst_cases(report: Report) -> Section:
+    galleries = (Gallery(run.name, cases) for run, cases in zip(report.runs, report.cases, strict=True))
+    return Section(
+        "Worst cases",
+        "The images with most failures, shared out among the conditions. Ellipses are true keypoints, crosses are "
+        "detections, numbers are IDs.",
+        tuple(galleries) if report.cases else (),
+    )
+
+
+def _all_groups(report: Report) -> Section:
+    listed = [(run, [g for g in run.by if g.key.radius_px is None]) for run in report.runs]
+    tables = tuple(group_table(groups, run.name, report.patch_names) for run, groups in listed if groups)
+    return Section("All groups", "Everything by condition, rung and patch.", tables)
+
+
+def _conditions(report: Report) -> list[str]:
+    return list(dict.fromkeys(name for run in report.runs for name in run.conditions))
 
 
 def to_markdown_report(report: Report) -> str:
-    """Tables and text of a report; charts and pictures are left out."""
-    return _text(report, to_markdown, "# {}", "## {}", lambda text: text, "```json\n{}\n```")
+    """Render the tables and the text of a report as Markdown, without charts and pictures."""
+    return _render_text(report, to_markdown, "# {}", "## {}", lambda text: text, "```json\n{}\n```")
 
 
 def to_latex_report(report: Report) -> str:
-    """Tables of a report, each a ``table`` environment, with the text between them as comments."""
+    """Render the tables of a report as LaTeX, each in a ``table`` environment. Other text becomes comments."""
 
     def comment(text: str) -> str:
         return "\n".join(f"% {line}" for line in text.splitlines())
 
-    return _text(report, to_latex, "% {}", "% {}", comment, None)
+    return _render_text(report, to_latex, "% {}", "% {}", comment, None)
 
 
-def _text(
+def _render_text(
     report: Report,
-    table: Callable[[Table], str],
-    head: str,
-    subhead: str,
-    text: Callable[[str], str],
+    to_text: Callable[[Table], str],
+    title: str,
+    section_title: str,
+    format_prose: Callable[[str], str],
     provenance: str | None,
 ) -> str:
-    parts = [head.format(report.title), text(_about(report))]
-    for section in sections(replace(report, cases=())):
-        parts += [subhead.format(section.title), text(section.lead)]
-        parts += [table(block) for block in section.blocks if isinstance(block, Table)]
-    known = json.dumps(report.provenance, indent=1)
-    parts.append(text(known) if provenance is None else provenance.format(known))
+    """Render a report in a form of plain text; titles and provenance are templates with one ``{}``."""
+    parts = [title.format(report.title), format_prose(_describe_images(report))]
+    for section in make_sections(replace(report, cases=())):
+        parts += [section_title.format(section.title), format_prose(section.lead)]
+        parts += [to_text(block) for block in section.blocks if isinstance(block, Table)]
+    content = json.dumps(report.provenance, indent=1)
+    parts.append(format_prose(content) if provenance is None else provenance.format(content))
     return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
 
-def _about(report: Report) -> str:
+def _describe_images(report: Report) -> str:
     first = report.runs[0]
     n = first.overall.counts
     made = f" {report.images}" if report.images else ""
-    mark = f", fingerprint {first.fingerprint[:16]}" if first.fingerprint else ""
-    return f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{mark}."
+    fingerprint = f", fingerprint {first.fingerprint[:16]}" if first.fingerprint else ""
+    return f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{fingerprint}."
 
 
 def to_html(report: Report) -> str:
-    """A page that needs nothing but itself: styles, script, charts and pictures are inside, and it may load nothing."""
+    """Render a report as one page of HTML that loads no other file: styles, script, charts and pictures are inside."""
     import jinja2
 
     folder = Path(__file__).parent / "templates"
@@ -228,29 +268,30 @@ def to_html(report: Report) -> str:
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     template = environment.from_string((folder / "report.html").read_text("utf-8"))
-    style = (folder / "report.css").read_text("utf-8") + STYLE
+    style = (folder / "report.css").read_text("utf-8") + CHART_STYLE
     return template.render(
         report=report,
-        about=_about(report),
+        about=_describe_images(report),
         style=style,
         script=(folder / "report.js").read_text("utf-8"),
-        sections=list(sections(report)),
+        sections=make_sections(report),
         provenance=json.dumps(report.provenance, indent=1),
         text=cell_text,
         sort_key=_sort_key,
         share=_share,
+        chart_colours=CHART_COLOURS,
         base64=lambda data: base64.b64encode(data).decode(),
     )
 
 
 def _sort_key(cell: Cell) -> str:
-    """What a browser sorts by: the bare number; nothing where there is none."""
+    """Return the text by which a browser sorts the cell: the number without its interval, "" for undefined."""
     value = cell.value if isinstance(cell, Estimate) else cell
     return "" if value is None else str(value)
 
 
 def _share(row: Sequence[Cell], cell: Cell) -> int:
-    """Percent that a count has of its row."""
+    """Return the percentage of a count in the sum of its row."""
     total = sum(c for c in row if isinstance(c, int))
     return round(100 * cell / total) if isinstance(cell, int) and total else 0
 
@@ -264,12 +305,24 @@ REPORT_WRITERS: dict[str, Callable[[Report], str]] = {
 
 
 def write_report(path: str | Path, report: Report) -> None:
-    """Write a report, whole or not at all. The suffix of the path selects the form: .html, .md or .tex.
+    """Write a report, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The suffix selects the form: .html, .md or .tex.
+    report : Report
 
     Raises
     ------
     DataError
         If the suffix is another or the file cannot be written.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.write_report("report.md", kpbench.report.Report((scores,)))
     """
     path = Path(path)
     require_report_suffix(path)

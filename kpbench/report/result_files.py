@@ -1,4 +1,4 @@
-"""Scores and comparisons as JSON and CSV, with their provenance."""
+"""Encode scores and comparisons as JSON and CSV, with their provenance."""
 
 from __future__ import annotations
 
@@ -15,17 +15,20 @@ import msgspec
 from kpbench import __version__
 from kpbench.files import sha256_of
 from kpbench.scoring.board_pose import PoseGroup
-from kpbench.scoring.breakpoints import breakpoints
+from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
 
 COMPARISON_SCHEMA = "kpbench.comparison/1"
+"""Name and version of the format of comparison files."""
 
 
-def provenance(dataset: Path, fingerprint: str, predictions: Sequence[Path], command: Sequence[str]) -> dict[str, Any]:
-    """List what numbers were made from: the files with their SHA-256, the dataset, versions.
+def collect_provenance(
+    dataset: Path, fingerprint: str, predictions: Sequence[Path], command: Sequence[str]
+) -> dict[str, Any]:
+    """Collect what numbers were made from: the predictions files with their SHA-256, the dataset, versions.
 
-    The time and the machine are left out, so that the same input gives the same bytes.
+    Time and machine are left out. So the same input gives the same bytes.
     """
     return {
         "kpbench": __version__,
@@ -36,27 +39,30 @@ def provenance(dataset: Path, fingerprint: str, predictions: Sequence[Path], com
     }
 
 
-def scores_file(scores: Scores, known: Mapping[str, Any], poses: Sequence[PoseGroup] = ()) -> bytes:
-    """The scores file (``kpbench.scores/1``): all numbers, the breakpoints, errors of the pose, and the provenance."""
-    content = scores.to_dict() | {"breakpoints": [b.to_dict() for b in breakpoints(scores)]}
+def encode_scores(scores: Scores, provenance: Mapping[str, Any], poses: Sequence[PoseGroup] = ()) -> bytes:
+    """Encode a scores file (``kpbench.scores/1``): all numbers, breakpoints, errors of the pose, provenance."""
+    content = scores.to_dict() | {"breakpoints": [b.to_dict() for b in find_breakpoints(scores)]}
     if poses:
         content["pose"] = [asdict(group) for group in poses]
-    return _json(content | {"provenance": known})
+    return _encode_json(content | {"provenance": provenance})
 
 
-def _json(content: Mapping[str, Any]) -> bytes:
+def encode_comparisons(comparisons: Sequence[Comparison], provenance: Mapping[str, Any]) -> bytes:
+    """Encode a comparison file (``kpbench.comparison/1``): every difference, and the provenance."""
+    content = {"schema": COMPARISON_SCHEMA, "comparisons": [c.to_dict() for c in comparisons]}
+    return _encode_json(content | {"provenance": provenance})
+
+
+def _encode_json(content: Mapping[str, Any]) -> bytes:
     return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
 
 
-def comparison_file(comparisons: Sequence[Comparison], known: Mapping[str, Any]) -> bytes:
-    """The comparison file (``kpbench.comparison/1``): every difference, and the provenance."""
-    content = {"schema": COMPARISON_SCHEMA, "comparisons": [c.to_dict() for c in comparisons], "provenance": known}
-    return _json(content)
+def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
+    """Encode scores as CSV, one row per group, the first overall.
 
-
-def scores_csv(scores: Scores, known: Mapping[str, Any]) -> bytes:
-    """One row a group, the first overall; each row says which detector, dataset and version it is of."""
-    about = {"detector": scores.name, "dataset": scores.fingerprint, "kpbench": known["kpbench"]}
+    Each row names detector, dataset and version of kpbench, so that tables can be joined.
+    """
+    about = {"detector": scores.name, "dataset": scores.fingerprint, "kpbench": provenance["kpbench"]}
     rows = [about | row for row in scores.rows()]
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")

@@ -16,6 +16,19 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
     """Write the settings, counts and metrics of a detector, and its tables of IDs, groups and poses.
 
     The paper's formulas as printed are left out where they give the same numbers in all groups.
+
+    Parameters
+    ----------
+    scores : Scores
+    poses : sequence of PoseGroup
+        Errors of the board's pose; may be empty.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> print(kpbench.report.summarise_scores(scores).splitlines()[0])
+    match        at most 0.1 of the major radius, one-to-one
     """
     overall, settings = scores.overall, scores.settings
     groups = (overall, *scores.by)
@@ -46,7 +59,15 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
 
 
 def summarise_comparisons(comparisons: Sequence[Comparison]) -> str:
-    """Write who is better than whom, and all differences."""
+    """Write the verdicts of the first detector against each other one, and all differences.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> print(kpbench.report.summarise_comparisons([kpbench.compare(scores, scores)]).splitlines()[0])
+    oracle against the others
+    """
     return "\n\n".join(map(_with_title, (verdict_table(comparisons), *map(difference_table, comparisons))))
 
 

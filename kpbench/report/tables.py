@@ -1,4 +1,4 @@
-"""Tables as data, and as text: terminal, Markdown, LaTeX. HTML is made by :mod:`kpbench.report`."""
+"""Tables as data, and as text for a terminal, Markdown and LaTeX. The HTML form is in ``templates/report.html``."""
 
 from __future__ import annotations
 
@@ -10,13 +10,21 @@ from kpbench.scoring.bootstrap import Interval
 
 
 class Estimate(NamedTuple):
-    """A number with its 95 % interval; None where it is undefined or has none."""
+    """A number with its 95 % interval; None where the number is undefined or has no interval.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.report.Estimate(0.882, (0.861, 0.901)).value
+    0.882
+    """
 
     value: float | None
     interval: Interval | None = None
 
 
 Cell = str | int | float | Estimate | None
+"""A cell of a table: text, a count, a number, a number with its interval, or None for undefined."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +36,20 @@ class Table:
     title : str
     columns : tuple of str
     rows : tuple of tuples of Cell
-        An int is written as it is, a float with three decimals (small ones with four), None as n/a.
+        An int is written as it is, a float with three decimals or four if it is small, None as n/a.
     note : str
-        What the reader must know, below the table.
+        A sentence for below the table.
     shade : bool
         Whether a page may shade each count by its share of the row.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> table = kpbench.report.Table("Two detectors", ("detector", "score"), (("a", 0.9), ("b", None)))
+    >>> print(kpbench.report.to_plain(table))
+    detector  score
+    a         0.900
+    b         n/a
     """
 
     title: str
@@ -43,7 +60,7 @@ class Table:
 
 
 def cell_text(cell: Cell, digits: int = 3) -> str:
-    """A cell as people read it; an estimate as ``0.882 [0.861, 0.901]``."""
+    """Write a cell with ``digits`` decimals, an estimate as ``0.882 [0.861, 0.901]``."""
     if cell is None:
         return "n/a"
     if isinstance(cell, Estimate):
@@ -57,7 +74,15 @@ def cell_text(cell: Cell, digits: int = 3) -> str:
 
 
 def to_plain(table: Table, digits: int = 3) -> str:
-    """Columns aligned with spaces, for a terminal; without title and note."""
+    """Write a table for a terminal: columns aligned with spaces, without title and note.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> print(kpbench.report.to_plain(kpbench.report.Table("", ("n", "score"), ((10, 0.5),))))
+    n   score
+    10  0.500
+    """
     rows = [list(table.columns), *([cell_text(cell, digits) for cell in row] for row in table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
@@ -65,7 +90,15 @@ def to_plain(table: Table, digits: int = 3) -> str:
 
 
 def to_markdown(table: Table) -> str:
-    """A GitHub table under its title in bold."""
+    r"""Write a table in GitHub's Markdown, under its title in bold.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> text = kpbench.report.to_markdown(kpbench.report.Table("Scores", ("detector", "score"), (("a", 0.5),)))
+    >>> text.splitlines()[-1]
+    '| a | 0.500 |'
+    """
 
     def line(cells: Sequence[str]) -> str:
         return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
@@ -75,22 +108,33 @@ def to_markdown(table: Table) -> str:
     return "\n".join([*lines, *(["", table.note] if table.note else []), ""])
 
 
-LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "ε": r"$\varepsilon$"} | {
+LATEX_OF = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "ε": r"$\varepsilon$"} | {
     c: f"\\{c}" for c in "&%$#_{}"
 }
+"""LaTeX of the characters that LaTeX does not print as they are."""
 
 
 def to_latex(table: Table) -> str:
-    """A ``table`` with a ``tabular`` that needs no package; the first column is left, all others right aligned."""
+    r"""Write a ``table`` environment with a ``tabular`` that needs no package.
 
-    def escaped(text: str) -> str:
-        return "".join(LATEX.get(c, c) for c in text)
+    The first column is aligned to the left, all others to the right.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> text = kpbench.report.to_latex(kpbench.report.Table("Scores", ("detector", "score"), (("a_b", 0.5),)))
+    >>> print(text.splitlines()[7])
+    a\_b & 0.500 \\
+    """
+
+    def escape(text: str) -> str:
+        return "".join(LATEX_OF.get(c, c) for c in text)
 
     def line(cells: Sequence[str]) -> str:
-        return f"{' & '.join(map(escaped, cells))} \\\\"
+        return f"{' & '.join(map(escape, cells))} \\\\"
 
     body = [line([cell_text(cell) for cell in row]) for row in table.rows]
-    caption = escaped(f"{table.title}. {table.note}" if table.note else table.title)
+    caption = escape(f"{table.title}. {table.note}" if table.note else table.title)
     return "\n".join(
         [
             r"\begin{table}",

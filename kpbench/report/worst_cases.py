@@ -1,4 +1,4 @@
-"""The images on which a detector failed worst, with truth and detections as shapes to draw over them."""
+"""Pick the images on which a detector fails worst, with truth and detections as marks to draw over them."""
 
 from __future__ import annotations
 
@@ -11,21 +11,46 @@ import numpy as np
 from kpbench.images import encode_jpeg
 from kpbench.scoring.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS
 from kpbench.scoring.metrics import SUMS
-from kpbench.scoring.outcomes import Tally
+from kpbench.scoring.outcomes import Outcomes
 from kpbench.types import UInt8
 
-MOST_SIDE_PX = 800  # larger images are shrunk; the marks keep the image's own px
+MOST_SIDE_PX = 800
+"""Longest side of a picture in the gallery; larger images are shrunk."""
 JPEG_QUALITY = 82
-KINDS = {MATCHED: "matched", DUPLICATE: "duplicate", NEAR_MISS: "near miss", CLUTTER: "clutter"}
+"""Quality of a picture in the gallery, of 100."""
+NAME_OF_KIND = {MATCHED: "matched", DUPLICATE: "duplicate", NEAR_MISS: "near miss", CLUTTER: "clutter"}
+FAILURES = ("missed", "wrong ID", "duplicate", "near miss", "clutter")
+"""Names of what can be wrong in an image."""
 
 
 @dataclass(frozen=True)
 class Mark:
-    """A true keypoint (with the axes of its disc) or a detection; px of the image, degrees."""
+    """A true keypoint or a detection, to be drawn over an image.
+
+    Attributes
+    ----------
+    x, y : float
+        Place, px of the whole image.
+    kind : str
+        Of a true keypoint: "matched", "wrong ID" or "missed". Of a detection: "matched", "wrong ID", "duplicate",
+        "near miss" or "clutter".
+    label : str
+        Identity, "" if unknown.
+    axes : (major, minor) or None
+        Semi-axes of a true keypoint's disc, px. None for a detection.
+    angle : float
+        Angle of the major axis, degrees from +x towards +y.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.report.Mark(10.0, 20.0, "clutter", "3").axes is None
+    True
+    """
 
     x: float
     y: float
-    kind: str  # of a keypoint: matched, wrong ID, missed; of a detection: one of KINDS, or wrong ID
+    kind: str
     label: str
     axes: tuple[float, float] | None = None
     angle: float = 0.0
@@ -33,67 +58,105 @@ class Mark:
 
 @dataclass(frozen=True)
 class Case:
-    """One image, or the part of it that holds all marks, with what was wrong in it."""
+    """An image with failures, cut to the part that holds all marks.
+
+    Attributes
+    ----------
+    image_id : int
+    condition : str
+    rung : float
+    box : (left, top, width, height)
+        The part of the image that the picture shows, px.
+    jpeg : bytes
+        The picture.
+    truth, detections : tuple of Mark
+    failures : dict of str to int
+        Number of each failure in the image: "missed", "wrong ID", "duplicate", "near miss", "clutter".
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> case = kpbench.report.Case(4, "blur", 7.0, (0, 0, 64, 48), b"", (), (), {"missed": 2})
+    >>> sum(case.failures.values())
+    2
+    """
 
     image_id: int
     condition: str
     rung: float
-    box: tuple[int, int, int, int]  # of the picture in the image: first column and row, width, height
+    box: tuple[int, int, int, int]
     jpeg: bytes
     truth: tuple[Mark, ...]
     detections: tuple[Mark, ...]
-    failures: dict[str, int]  # missed, wrong ID, duplicate, near miss, clutter
+    failures: dict[str, int]
 
 
-def worst_cases(rows: Tally, image: Callable[[int], UInt8], count: int = 12) -> tuple[Case, ...]:
-    """The images with most failures, worst first, shared out evenly among the conditions.
+def pick_worst_cases(outcomes: Outcomes, image: Callable[[int], UInt8], count: int = 12) -> tuple[Case, ...]:
+    """Pick the images with most failures, worst first, about as many of each condition.
 
     Parameters
     ----------
-    rows : Tally
-    image : function from a position in the truth to the image, (H, W) or (H, W, 3) uint8.
-    count : at most so many; an image without failures is never among them.
+    outcomes : Outcomes
+    image : function
+        Reads the image at a position of the truth, uint8 of shape (H, W) or (H, W, 3) RGB.
+    count : int
+        Largest number of images. Images without failures are not picked.
+
+    Returns
+    -------
+    tuple of Case
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> dataset = kpbench.open_dataset("kpbench-data")
+    >>> nothing = kpbench.score(dataset, [kpbench.Detections.none()] * len(dataset))
+    >>> case = kpbench.report.pick_worst_cases(nothing.outcomes, dataset.image)[0]
+    >>> case.failures == {"missed": len(case.truth)}
+    True
     """
-    n = dict(zip(SUMS, rows.image_sums.T, strict=True))
-    failures = (n["truths"] - n["id_correct"] if rows.patch_id is not None else n["truths"] - n["matched"]) + (
-        n["detections"] - n["matched"]
-    )
-    condition = rows.truth.condition
-    most = -(-count // len(np.unique(condition)))
-    taken: dict[str, int] = {}
-    chosen: list[int] = []
+    n = dict(zip(SUMS, outcomes.image_sums.T, strict=True))
+    found = n["matched"] if outcomes.detections.patch_id is None else n["id_correct"]
+    failures = (n["truths"] - found) + (n["detections"] - n["matched"])
+    condition = outcomes.truth.condition
+    most_per_condition = -(-count // len(np.unique(condition)))
+    picked_of: dict[str, int] = {}
+    picked: list[int] = []
     for k in np.argsort(-failures, kind="stable").tolist():
-        if len(chosen) == count or not failures[k]:
+        if len(picked) == count or not failures[k]:
             break
         name = str(condition[k])
-        if taken.get(name, 0) < most:
-            taken[name] = taken.get(name, 0) + 1
-            chosen.append(k)
-    return tuple(_case(rows, k, image(k)) for k in chosen)
+        if picked_of.get(name, 0) < most_per_condition:
+            picked_of[name] = picked_of.get(name, 0) + 1
+            picked.append(k)
+    return tuple(_make_case(outcomes, k, image(k)) for k in picked)
 
 
-def _case(rows: Tally, k: int, image: UInt8) -> Case:
-    truth = tuple(_true(rows, t) for t in np.flatnonzero(rows.truth_image == k).tolist())
-    explained = {int(rows.detection[t]): bool(rows.correct[t]) for t in np.flatnonzero(rows.truth_image == k)}
-    found = tuple(_found(rows, d, explained.get(d)) for d in np.flatnonzero(rows.image == k).tolist())
-    kinds = [mark.kind for mark in (*truth, *found) if mark.axes or mark.kind not in ("matched", "wrong ID")]
-    failures = {kind: kinds.count(kind) for kind in ("missed", "wrong ID", "duplicate", "near miss", "clutter")}
-    box = _box((*truth, *found), image.shape[1], image.shape[0])
+def _make_case(outcomes: Outcomes, k: int, image: UInt8) -> Case:
+    keypoints = np.flatnonzero(outcomes.truth_points.image == k).tolist()
+    found = np.flatnonzero(outcomes.detections.image == k).tolist()
+    is_correct = {int(outcomes.matches.detection[t]): bool(outcomes.correct[t]) for t in keypoints}
+    truth = tuple(_mark_of_truth(outcomes, t) for t in keypoints)
+    detections = tuple(_mark_of_detection(outcomes, d, is_correct.get(d, True)) for d in found)
+    # A wrong ID marks both the keypoint and its detection, and counts once
+    kinds = [mark.kind for mark in truth] + [mark.kind for mark in detections if mark.kind != "wrong ID"]
+    left, top, width, height = box = _box_around((*truth, *detections), image.shape[1], image.shape[0])
     return Case(
-        image_id=int(rows.truth.image_id[k]),
-        condition=str(rows.truth.condition[k]),
-        rung=float(rows.truth.rung[k]),
+        image_id=int(outcomes.truth.image_id[k]),
+        condition=str(outcomes.truth.condition[k]),
+        rung=float(outcomes.truth.rung[k]),
         box=box,
-        jpeg=_jpeg(image[box[1] : box[1] + box[3], box[0] : box[0] + box[2]]),
+        jpeg=_encode_jpeg(image[top : top + height, left : left + width]),
         truth=truth,
-        detections=found,
-        failures={kind: n for kind, n in failures.items() if n},
+        detections=detections,
+        failures={kind: kinds.count(kind) for kind in FAILURES if kind in kinds},
     )
 
 
-def _true(rows: Tally, t: int) -> Mark:
-    keypoint = rows.truth.keypoints[t]
-    kind = "missed" if not rows.matched[t] else "matched" if rows.correct[t] or rows.patch_id is None else "wrong ID"
+def _mark_of_truth(outcomes: Outcomes, t: int) -> Mark:
+    keypoint = outcomes.truth.keypoints[t]
+    is_right = outcomes.correct[t] or outcomes.detections.patch_id is None
+    kind = "missed" if not outcomes.matched[t] else "matched" if is_right else "wrong ID"
     return Mark(
         float(keypoint["x"]),
         float(keypoint["y"]),
@@ -104,25 +167,30 @@ def _true(rows: Tally, t: int) -> Mark:
     )
 
 
-def _found(rows: Tally, d: int, correct: bool | None) -> Mark:
-    kind = "wrong ID" if correct is False and rows.patch_id is not None else KINDS[int(rows.kind[d])]
-    label = "" if rows.patch_id is None else str(rows.patch_id[d])
-    return Mark(float(rows.xy[d, 0]), float(rows.xy[d, 1]), kind, label)
+def _mark_of_detection(outcomes: Outcomes, d: int, is_correct: bool) -> Mark:
+    found = outcomes.detections
+    is_right = is_correct or found.patch_id is None
+    kind = NAME_OF_KIND[int(outcomes.matches.kind[d])] if is_right else "wrong ID"
+    label = "" if found.patch_id is None else str(found.patch_id[d])
+    return Mark(float(found.xy[d, 0]), float(found.xy[d, 1]), kind, label)
 
 
-def _box(marks: tuple[Mark, ...], width: int, height: int) -> tuple[int, int, int, int]:
-    """The part of the image around all marks, of the image's proportions and at least a quarter of its sides."""
-    around = [3 * m.axes[0] if m.axes else 0.0 for m in marks]
+def _box_around(marks: tuple[Mark, ...], width: int, height: int) -> tuple[int, int, int, int]:
+    """Return the part of an image that holds all marks: left, top, width, height.
+
+    It has the proportions of the image, and at least a quarter of the image's sides.
+    """
+    margin = [3 * m.axes[0] if m.axes else 0.0 for m in marks]
     x, y = (np.array([getattr(m, axis) for m in marks]) for axis in ("x", "y"))
-    spans = [(v - around).min() for v in (x, y)], [(v + around).max() for v in (x, y)]
-    share = np.clip(max((b - a) / side for a, b, side in zip(*spans, (width, height), strict=True)), 0.25, 1.0)
+    low, high = [(v - margin).min() for v in (x, y)], [(v + margin).max() for v in (x, y)]
+    share = np.clip(max((b - a) / side for a, b, side in zip(low, high, (width, height), strict=True)), 0.25, 1.0)
     box_width, box_height = int(np.ceil(share * width)), int(np.ceil(share * height))
-    left = int(np.clip((spans[0][0] + spans[1][0] - box_width) / 2, 0, width - box_width))
-    top = int(np.clip((spans[0][1] + spans[1][1] - box_height) / 2, 0, height - box_height))
+    left = int(np.clip((low[0] + high[0] - box_width) / 2, 0, width - box_width))
+    top = int(np.clip((low[1] + high[1] - box_height) / 2, 0, height - box_height))
     return left, top, box_width, box_height
 
 
-def _jpeg(image: UInt8) -> bytes:
+def _encode_jpeg(image: UInt8) -> bytes:
     scale = MOST_SIDE_PX / max(image.shape[:2])
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)

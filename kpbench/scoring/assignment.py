@@ -1,14 +1,15 @@
-"""Which detection explains which true keypoint: one-to-one, over all images at once.
+"""Match detections to true keypoints one to one, in all images at once.
 
-Most matches first, then the highest scores, then the smallest distances, then place in (x, y). Identities
-never decide, and the order of images, keypoints and detections changes nothing.
+Of all one-to-one assignments the best one is taken: the most matches, then the highest scores, then the smallest
+distances, then the lowest place in (x, y). Identities never decide. The order of images, keypoints and detections
+changes nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,28 +20,95 @@ from scipy.sparse.csgraph import connected_components
 from kpbench.types import Float, Int
 
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
-"""What a detection is: see :class:`Matches`."""
-PAIRS_AT_ONCE = 2_000_000  # candidate pairs in memory at a time
+"""The kinds of a detection, see :class:`Matches`."""
+PAIRS_PER_BLOCK = 2_000_000
+"""Number of candidate pairs whose distances are in memory at a time."""
+
+
+@dataclass(frozen=True)
+class TruthPoints:
+    """The true keypoints of all images as columns.
+
+    Attributes
+    ----------
+    xy : ndarray of shape (T, 2), float64
+        Place, px.
+    radius : ndarray of shape (T,), float64
+        Radius of the keypoint's disc, px. The largest distance of a match is a fraction of it.
+    image : ndarray of shape (T,), int64
+        Number of the image, 0 or more.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.scoring import TruthPoints
+    >>> points = TruthPoints(np.array([[10.0, 10.0]]), np.array([5.0]), np.array([0]))
+    >>> points.xy.shape
+    (1, 2)
+    """
+
+    xy: Float
+    radius: Float
+    image: Int
+
+
+@dataclass(frozen=True)
+class DetectionPoints:
+    """The detections in all images as columns.
+
+    Attributes
+    ----------
+    xy : ndarray of shape (D, 2), float64
+        Place, px.
+    score : ndarray of shape (D,), float64
+        The higher, the surer.
+    image : ndarray of shape (D,), int64
+        Number of the image, 0 or more.
+    patch_id : ndarray of shape (D,), int64, or None
+        Detected identity. It decides :attr:`Matches.contradicted` and nothing else.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.scoring import DetectionPoints
+    >>> points = DetectionPoints(np.array([[10.0, 11.0]]), np.array([0.9]), np.array([0]))
+    >>> points.patch_id is None
+    True
+    """
+
+    xy: Float
+    score: Float
+    image: Int
+    patch_id: Int | None = None
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Who was matched to whom, for T true keypoints and D detections of any number of images.
+    """The matches of T true keypoints and D detections, in any number of images.
 
     Attributes
     ----------
     detection : ndarray of shape (T,), int64
-        The detection that a true keypoint was matched to, or -1.
-    distance : ndarray of shape (T,), float64, px
-        To that detection; nan where there is none.
+        The detection that is matched to the true keypoint, or -1.
+    distance : ndarray of shape (T,), float64
+        Distance to the matched detection, px; nan without a match.
     contradicted : ndarray of shape (T,), bool
-        Whether another detection equals the matched one in place and score but not in identity: then the
-        detector has not said which identity it means, and no order may decide it.
+        Whether a second detection has the place and the score of the matched one but another identity. The detector
+        has then named both identities, and no order may decide between them.
     nearest : ndarray of shape (D,), int64
-        The nearest true keypoint that a detection reaches, matched or not, or -1.
+        The nearest true keypoint within the largest distance of a match, or -1.
     kind : ndarray of shape (D,), uint8
-        ``MATCHED``; ``DUPLICATE``: it reaches a keypoint that another detection explains; ``NEAR_MISS``: it
-        reaches none, but lies within one radius of one; ``CLUTTER``: all else.
+        ``MATCHED``; ``DUPLICATE``: within the largest distance of a match, but not matched; ``NEAR_MISS``: farther
+        away, but within one radius of a true keypoint; ``CLUTTER``: everything else.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> outcomes = kpbench.scoring.match_predictions(
+    ...     kpbench.open_dataset("kpbench-data").truth, kpbench.read_predictions("preds.json")
+    ... )
+    >>> int((outcomes.matches.detection < 0).sum())  # the detector missed one keypoint
+    1
     """
 
     detection: Int
@@ -50,141 +118,152 @@ class Matches:
     kind: NDArray[np.uint8]
 
 
-def match(
-    truth_xy: Float,
-    truth_image: Int,
-    radius: Float,
-    eps: float,
-    xy: Float,
-    score: Float,
-    image: Int,
-    patch_id: Int | None = None,
-) -> Matches:
-    """Match the detections of all images at once.
+class _Pairs(NamedTuple):
+    """Pairs of a true keypoint and a detection of one image, as columns of P rows."""
+
+    t: Int
+    """Row of the true keypoint."""
+    d: Int
+    """Row of the detection."""
+    distance: Float
+    """Distance of the two, px."""
+
+    def select(self, rows: Int | NDArray[np.bool_]) -> _Pairs:
+        return _Pairs(self.t[rows], self.d[rows], self.distance[rows])
+
+
+def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
+    """Match the detections of all images to the true keypoints.
 
     Parameters
     ----------
-    truth_xy : ndarray of shape (T, 2), px
-    truth_image : ndarray of shape (T,)
-        Number of the image, 0 or more, of each true keypoint.
-    radius : ndarray of shape (T,), px
+    truth : TruthPoints
+    found : DetectionPoints
     eps : float
-        In radii; a distance equal to ``eps * radius`` is a match.
-    xy : ndarray of shape (D, 2), px
-    score : ndarray of shape (D,)
-    image : ndarray of shape (D,)
-    patch_id : ndarray of shape (D,), optional
-        Used for ``contradicted`` only.
+        Largest distance of a match, in radii of the true keypoint. A distance equal to ``eps * radius`` is a match.
+
+    Returns
+    -------
+    Matches
     """
-    reach = eps * radius
-    t, d, distance = _pairs_within(truth_xy, truth_image, np.maximum(reach, radius), xy, image)
-    kind = np.full(len(xy), CLUTTER, np.uint8)
-    kind[d] = NEAR_MISS
-    inside = distance <= reach[t]
-    t, d, distance = t[inside], d[inside], distance[inside]
-    kind[d] = DUPLICATE
+    reach = eps * truth.radius
+    near = _find_pairs(truth, found, np.maximum(reach, truth.radius))
+    pairs = near.select(near.distance <= reach[near.t])
+    contested = _find_contested(pairs)
 
-    contested = _contested(t, d)
-    detection, gap = np.full(len(truth_xy), -1), np.full(len(truth_xy), np.nan)
-    won = _explain(t, d, distance, contested, truth_xy, xy, score)
-    detection[t[won]], gap[t[won]] = d[won], distance[won]
+    detection, distance = np.full(len(truth.xy), -1), np.full(len(truth.xy), np.nan)
+    won = pairs.select(_choose_matches(pairs, contested, truth, found))
+    detection[won.t], distance[won.t] = won.d, won.distance
+
+    kind = np.full(len(found.xy), CLUTTER, np.uint8)
+    kind[near.d] = NEAR_MISS
+    kind[pairs.d] = DUPLICATE
     kind[detection[detection >= 0]] = MATCHED
-
-    shared = np.bincount(d, minlength=len(xy))[d] > 1
-    nearest = np.full(len(xy), -1)
-    nearest[d[~shared]] = t[~shared]
-    torn = np.flatnonzero(shared)
-    closest = torn[_best(d[torn], distance[torn], truth_xy[t[torn], 0], truth_xy[t[torn], 1])]
-    nearest[d[closest]] = t[closest]
-
-    contradicted = np.zeros(len(truth_xy), bool)
-    if patch_id is not None:
-        t, d = t[contested], d[contested]
-        t, d = t[detection[t] >= 0], d[detection[t] >= 0]
-        twin = (score[d] == score[detection[t]]) & (xy[d] == xy[detection[t]]).all(axis=1)
-        contradicted[t[twin & (patch_id[d] != patch_id[detection[t]])]] = True
-    return Matches(detection, gap, contradicted, nearest, kind)
+    contradicted = _find_contradicted(pairs.select(contested), detection, found)
+    return Matches(detection, distance, contradicted, _find_nearest(pairs, truth, found), kind)
 
 
-def matched_within(
-    truth_xy: Float, truth_image: Int, radius: Float, eps: Sequence[float], xy: Float, score: Float, image: Int
-) -> list[int]:
-    """How many keypoints are matched at each ``eps``; parameters are those of :func:`match`."""
-    t, d, distance = _pairs_within(truth_xy, truth_image, max(eps) * radius, xy, image)
+def count_matches(truth: TruthPoints, found: DetectionPoints, eps: Sequence[float]) -> list[int]:
+    """Count the matched keypoints at each of several ``eps``, which are as for :func:`match`."""
+    near = _find_pairs(truth, found, max(eps) * truth.radius)
     counts = []
     for value in eps:
-        near = distance <= value * radius[t]
-        pairs = t[near], d[near], distance[near]
-        counts.append(len(_explain(*pairs, _contested(*pairs[:2]), truth_xy, xy, score)))
+        pairs = near.select(near.distance <= value * truth.radius[near.t])
+        counts.append(len(_choose_matches(pairs, _find_contested(pairs), truth, found)))
     return counts
 
 
-def _contested(t: Int, d: Int) -> NDArray[np.bool_]:
-    """Which pairs share a keypoint or a detection with another; nearly none do."""
+def _find_contested(pairs: _Pairs) -> NDArray[np.bool_]:
+    """Mark the pairs that share a keypoint or a detection with another pair. In practice they are few."""
+    t, d = pairs.t, pairs.d
     return (np.bincount(t)[t] > 1) | (np.bincount(d)[d] > 1) if len(t) else np.zeros(0, bool)
 
 
-def _explain(
-    t: Int, d: Int, distance: Float, contested: NDArray[np.bool_], truth_xy: Float, xy: Float, score: Float
-) -> Int:
-    """Rows of the pairs that are matches."""
+def _choose_matches(
+    pairs: _Pairs, contested: NDArray[np.bool_], truth: TruthPoints, found: DetectionPoints
+) -> NDArray[np.int64]:
+    """Return the rows of the pairs that are matches."""
     rows = np.flatnonzero(contested)
-    won = _resolve(t[rows], d[rows], distance[rows], truth_xy, xy, score)
-    return np.concatenate([np.flatnonzero(~contested), rows[won]])
+    return np.concatenate([np.flatnonzero(~contested), rows[_assign_contested(pairs.select(rows), truth, found)]])
 
 
-def _pairs_within(truth_xy: Float, truth_image: Int, reach: Float, xy: Float, image: Int) -> tuple[Int, Int, Float]:
-    """All (keypoint, detection) pairs of one image that are at most ``reach`` (of the keypoint) apart, in px.
+def _find_nearest(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
+    """Return the nearest true keypoint of each detection, or -1. Of equally near ones the lowest in (x, y) counts."""
+    shared = np.bincount(pairs.d, minlength=len(found.xy))[pairs.d] > 1
+    nearest = np.full(len(found.xy), -1)
+    nearest[pairs.d[~shared]] = pairs.t[~shared]
+    several = pairs.select(shared)
+    x, y = truth.xy[several.t].T
+    closest = several.select(_first_of_each(several.d, several.distance, x, y))
+    nearest[closest.d] = closest.t
+    return nearest
 
-    All images lie side by side on one sorted axis, image number times a stride plus x, so that one binary
-    search a keypoint finds who is near in x. The axis is coarse; the distance itself is exact.
+
+def _find_contradicted(contested: _Pairs, detection: Int, found: DetectionPoints) -> NDArray[np.bool_]:
+    """Mark the keypoints whose match has a twin of another identity, see :attr:`Matches.contradicted`."""
+    contradicted = np.zeros(len(detection), bool)
+    if found.patch_id is not None:
+        t, d = contested.t, contested.d
+        t, d = t[detection[t] >= 0], d[detection[t] >= 0]
+        match_of_t = detection[t]
+        twin = (found.score[d] == found.score[match_of_t]) & (found.xy[d] == found.xy[match_of_t]).all(axis=1)
+        contradicted[t[twin & (found.patch_id[d] != found.patch_id[match_of_t])]] = True
+    return contradicted
+
+
+def _find_pairs(truth: TruthPoints, found: DetectionPoints, reach: Float) -> _Pairs:
+    """Return all pairs of a keypoint and a detection of its image that are at most ``reach`` (T,) px apart.
+
+    All images lie side by side on one sorted axis: the image's number times a stride, plus x. One binary search per
+    keypoint then finds the detections that are near in x. Rounding on this long axis is allowed for by ``slack``; the
+    distance itself is computed from the places.
     """
-    nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
-    if not len(truth_xy) or not len(xy):
-        return nothing
-    low, high = (truth_xy[:, 0] - reach).min(), (truth_xy[:, 0] + reach).max()
+    none = _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
+    if not len(truth.xy) or not len(found.xy):
+        return none
+    low, high = (truth.xy[:, 0] - reach).min(), (truth.xy[:, 0] + reach).max()
     stride = 2 * (high - low) + 1
-    slack = (1 + truth_image.max()) * stride * 1e-15
-    place = np.clip(xy[:, 0], low, high) - low + stride * image
+    slack = (1 + truth.image.max()) * stride * 1e-15
+    place = np.clip(found.xy[:, 0], low, high) - low + stride * found.image
     order = np.argsort(place)
     place = place[order]
-    centre = truth_xy[:, 0] - low + stride * truth_image
+    centre = truth.xy[:, 0] - low + stride * truth.image
     first = np.searchsorted(place, centre - reach - slack, side="left")
-    many = np.searchsorted(place, centre + reach + slack, side="right") - first
-    ends = np.cumsum(many)
-    found = [nothing]
+    count = np.searchsorted(place, centre + reach + slack, side="right") - first
+    ends = np.cumsum(count)
+    blocks = [none]
     start = 0
-    while start < len(truth_xy):  # in blocks, to bound the memory
-        stop = max(start + 1, int(np.searchsorted(ends, ends[start] + PAIRS_AT_ONCE)))
-        t = np.repeat(np.arange(start, stop), many[start:stop])
-        within = np.arange(len(t)) - (ends[t] - many[t] - (ends[start] - many[start]))
-        d = order[first[t] + within]
+    while start < len(truth.xy):
+        stop = max(start + 1, int(np.searchsorted(ends, ends[start] + PAIRS_PER_BLOCK)))
+        t = np.repeat(np.arange(start, stop), count[start:stop])
+        number_within_t = np.arange(len(t)) - (ends[t] - count[t] - (ends[start] - count[start]))
+        d = order[first[t] + number_within_t]
         with np.errstate(over="ignore"):
-            distance = np.hypot(xy[d, 0] - truth_xy[t, 0], xy[d, 1] - truth_xy[t, 1])
-        near = distance <= reach[t]
-        found.append((t[near], d[near], distance[near]))
+            distance = np.hypot(found.xy[d, 0] - truth.xy[t, 0], found.xy[d, 1] - truth.xy[t, 1])
+        blocks.append(_Pairs(t, d, distance).select(distance <= reach[t]))
         start = stop
-    ts, ds, distances = zip(*found, strict=True)
-    return np.concatenate(ts), np.concatenate(ds), np.concatenate(distances)
+    return _Pairs(*map(np.concatenate, zip(*blocks, strict=True)))
 
 
-def _best(group: Int, *keys: NDArray[Any]) -> Int:
-    """Of each group the row that is smallest in ``keys``, the first key counting most."""
+def _first_of_each(group: Int, *keys: NDArray[Any]) -> Int:
+    """Return for each group the row that is smallest in ``keys``. The first key counts most."""
     order = np.lexsort((*reversed(keys), group))
     first: Int = order[np.append(True, np.diff(group[order]) != 0)[: len(order)]]
     return first
 
 
-def _resolve(t: Int, d: Int, distance: Float, truth_xy: Float, xy: Float, score: Float) -> Int:
-    """Which of the contested pairs are matches."""
-    # Detections that no other keypoint wants: the best of them takes the keypoint
+def _assign_contested(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
+    """Return the rows of those contested pairs that are matches."""
+    t, d, distance = pairs
+    xy, score = found.xy, found.score
+    # A keypoint alone with detections that reach no other keypoint takes the best of them
     entangled = np.isin(t, t[np.bincount(d)[d] > 1]) if len(d) else np.zeros(0, bool)
     star = np.flatnonzero(~entangled)
-    won = [star[_best(t[star], -score[d[star]], distance[star], xy[d[star], 0], xy[d[star], 1])]]
-    # The rest in canonical numbers (best detection first), so that no input order can be felt
+    won = [star[_first_of_each(t[star], -score[d[star]], distance[star], xy[d[star], 0], xy[d[star], 1])]]
+    # The others are numbered by score and place, so that the order of the input cannot decide between equals
     rest = np.flatnonzero(entangled)
     keypoints, a = np.unique(t[rest], return_inverse=True)
-    a = _rank(truth_xy[keypoints, 1], truth_xy[keypoints, 0])[a]
+    a = _rank(truth.xy[keypoints, 1], truth.xy[keypoints, 0])[a]
     detections, b = np.unique(d[rest], return_inverse=True)
     b = _rank(xy[detections, 1], xy[detections, 0], -score[detections])[b]
     nodes = len(keypoints) + len(detections)
@@ -192,32 +271,33 @@ def _resolve(t: Int, d: Int, distance: Float, truth_xy: Float, xy: Float, score:
     component = connected_components(graph, directed=False)[1][a] if nodes else a
     order = np.argsort(component, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
-        won.append(rest[rows[_assign(a[rows], b[rows], distance[rest[rows]], score[d[rest[rows]]])]])
+        won.append(rest[rows[_assign_component(a[rows], b[rows], distance[rest[rows]], score[d[rest[rows]]])]])
     return np.concatenate(won)
 
 
 def _rank(*keys: Float) -> Int:
-    """Position of each row when sorted by the last key, then the one before, …"""
+    """Return the position of each row in an order in which the last key counts most."""
     rank = np.empty(len(keys[0]), np.int64)
     rank[np.lexsort(keys)] = np.arange(len(rank))
     return rank
 
 
-def _assign(a: Int, b: Int, distance: Float, score: Float) -> Int:
-    """Rows of the optimal one-to-one assignment within one connected component of pairs (a, b).
+def _assign_component(a: Int, b: Int, distance: Float, score: Float) -> Int:
+    """Return the rows of the best one-to-one assignment within one connected component of pairs (a, b).
 
-    The sets of detections that can be matched together are a matroid (a transversal one). So with *any* positive
-    weights that rise with the score, the heaviest assignment has most matches and the highest scores. Whole
-    numbers, the rank of the score, leave the fraction to the distances: their sum counts less than one rank.
+    The sets of detections that can be matched at the same time form a matroid (a transversal matroid). So with any
+    positive weights that rise with the score, the heaviest assignment has the most matches and the highest scores.
+    The weight is the rank of the score, a whole number, less a fraction for the distance. All fractions together
+    count less than one rank.
     """
     if not len(a):
         return np.zeros(0, np.int64)
     (rows, row), (columns, column) = np.unique(a, return_inverse=True), np.unique(b, return_inverse=True)
     rank = np.unique(score, return_inverse=True)[1] + 1
     unit = (distance.max() or 1.0) * (min(len(rows), len(columns)) + 1)
-    gain = np.zeros((len(rows), len(columns)))
-    gain[row, column] = rank - distance / unit
-    pair = np.full(gain.shape, -1)
+    weight = np.zeros((len(rows), len(columns)))
+    weight[row, column] = rank - distance / unit
+    pair = np.full(weight.shape, -1)
     pair[row, column] = np.arange(len(a))
-    chosen = pair[linear_sum_assignment(gain, maximize=True)]
+    chosen = pair[linear_sum_assignment(weight, maximize=True)]
     return np.asarray(chosen[chosen >= 0])

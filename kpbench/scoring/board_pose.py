@@ -1,4 +1,4 @@
-"""What a detector's errors mean for the pose of a known board: solvePnP on the matched detections."""
+"""Compute the errors of a known board's pose that follow from a detector's errors."""
 
 from __future__ import annotations
 
@@ -9,23 +9,32 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
-from kpbench.scoring.outcomes import Tally
+from kpbench.scoring.outcomes import Outcomes
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
-LEAST_POINTS = 4  # that fix the pose of a plane
+LEAST_POINTS = 4
+"""Number of points that fix the pose of a plane."""
 
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of the pose in each of N images; nan where fewer than four keypoints were matched.
+    """The errors of the board's pose in each of N images; nan where fewer than four keypoints are matched.
 
     Attributes
     ----------
     translation_percent : ndarray of shape (N,), float64
-        Distance between the estimated and the true place of the board's origin, in % of its true distance.
+        Distance between the estimated and the true place of the board's origin, in % of its true distance from the
+        camera.
     rotation_deg : ndarray of shape (N,), float64
-        Angle of the rotation between the estimated and the true orientation.
+        Angle between the estimated and the true orientation, degrees.
+
+    Examples
+    --------
+    >>> import numpy as np, kpbench
+    >>> errors = kpbench.scoring.PoseErrors(np.array([0.1, np.nan]), np.array([0.5, np.nan]))
+    >>> int(np.isfinite(errors.rotation_deg).sum())
+    1
     """
 
     translation_percent: Float
@@ -34,16 +43,26 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class PoseGroup:
-    """Errors of the pose over all images (condition and rung None) or those of one rung; None without any pose.
+    """Percentiles of the pose errors of a group of images: all images, or those of one condition and rung.
+
+    The percentiles are those of the images with a pose; None without any.
 
     Attributes
     ----------
     condition : str or None
+        None for all images.
     rung : float or None
+        None for all images.
     images, with_pose : int
-        Images of the group, and those whose pose is known.
+        Number of images, and number of images with a pose.
     translation_median_percent, translation_p95_percent : float or None
     rotation_median_deg, rotation_p95_deg : float or None
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.scoring.PoseGroup("blur", 15, 20, 19, 0.1, 0.4, 0.3, 1.2).with_pose
+    19
     """
 
     condition: str | None
@@ -56,53 +75,97 @@ class PoseGroup:
     rotation_p95_deg: float | None
 
 
-def pose_groups(run: Scores, errors: PoseErrors) -> tuple[PoseGroup, ...]:
-    """Median and 95th percentile of the errors, over all images and for each condition and rung."""
-    truth = run.tally.truth
-
-    def group(condition: str | None, rung: float | None, chosen: NDArray[np.bool_]) -> PoseGroup:
-        known = chosen & np.isfinite(errors.rotation_deg)
-        both = errors.translation_percent[known], errors.rotation_deg[known]
-        spread = [v for e in both for v in (np.percentile(e, [50, 95]).tolist() if len(e) else (None, None))]
-        return PoseGroup(condition, rung, int(chosen.sum()), int(known.sum()), *spread)
-
-    rungs = [(name, r) for name, ladder in run.conditions.items() for r in ladder]
-    return (
-        group(None, None, np.ones(len(truth), bool)),
-        *(group(name, r, (truth.condition == name) & (truth.rung == r)) for name, r in rungs),
-    )
-
-
-def pose_errors(rows: Tally, points_mm: Float, camera: Camera) -> PoseErrors:
-    """Pose of the board from the matched detections of each image, against that from the true keypoints.
-
-    The match says which keypoint of the board a detection is, so identities and false alarms do not enter; a planar
-    board seen from far may flip, which counts as the error that it is.
+def group_pose_errors(scores: Scores, errors: PoseErrors) -> tuple[PoseGroup, ...]:
+    """Compute the median and the 95th percentile of pose errors.
 
     Parameters
     ----------
-    rows : Tally
-    points_mm : ndarray of shape (K, 3)
-        The board's keypoints with z = 0, in the order in which they stand in the truth of every image.
+    scores : Scores
+        The scores whose outcomes the errors were computed from.
+    errors : PoseErrors
+
+    Returns
+    -------
+    tuple of PoseGroup
+        All images, then each condition and rung.
+
+    Examples
+    --------
+    >>> import numpy as np, kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> images = scores.overall.counts["images"]
+    >>> errors = kpbench.scoring.PoseErrors(np.full(images, 0.5), np.full(images, 2.0))
+    >>> kpbench.scoring.group_pose_errors(scores, errors)[0].rotation_median_deg
+    2.0
+    """
+    truth = scores.outcomes.truth
+
+    def group(condition: str | None, rung: float | None, images: NDArray[np.bool_]) -> PoseGroup:
+        with_pose = images & np.isfinite(errors.rotation_deg)
+        both = errors.translation_percent[with_pose], errors.rotation_deg[with_pose]
+        percentiles = [v for e in both for v in (np.percentile(e, [50, 95]).tolist() if len(e) else (None, None))]
+        return PoseGroup(condition, rung, int(images.sum()), int(with_pose.sum()), *percentiles)
+
+    keys = [(name, rung) for name, rungs in scores.conditions.items() for rung in rungs]
+    return (
+        group(None, None, np.ones(len(truth), bool)),
+        *(group(name, rung, (truth.condition == name) & (truth.rung == rung)) for name, rung in keys),
+    )
+
+
+def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) -> PoseErrors:
+    """Compare the board's pose from the matched detections of each image with that from the true keypoints.
+
+    Both poses are estimated by ``solvePnP``. The match tells which keypoint of the board a detection is, so wrong
+    identities and false alarms have no influence. A planar board that is seen from far may flip; the flip counts as a
+    large rotation.
+
+    Parameters
+    ----------
+    outcomes : Outcomes
+    points_mm : ndarray of shape (K, 3), float64
+        The board's keypoints, mm in the frame of the board, z = 0, in the order of each image's true keypoints.
     camera : Camera
+
+    Returns
+    -------
+    PoseErrors
 
     Raises
     ------
     DataError
-        If an image does not show exactly the K keypoints.
+        If an image does not show exactly K keypoints.
+
+    Examples
+    --------
+    >>> import numpy as np, kpbench
+    >>> from kpbench.geometry import Camera
+    >>> points_mm = np.array([[0.0, 0, 0], [90, 0, 0], [90, 60, 0], [0, 60, 0]])
+    >>> camera = Camera(640, 480, 500.0)
+    >>> xy = camera.project(points_mm + [0, 0, 400])
+    >>> keypoints = np.zeros(4, kpbench.KEYPOINT_DTYPE)
+    >>> keypoints["x"], keypoints["y"] = xy.T
+    >>> keypoints["radius_major"] = 20
+    >>> truth = kpbench.Truth(
+    ...     np.array([0]), np.array([0, 4]), keypoints, np.array([""]), np.array([np.nan]), np.array([0])
+    ... )
+    >>> scores = kpbench.score(truth, [kpbench.Detections(xy, np.ones(4))])
+    >>> errors = kpbench.scoring.compute_pose_errors(scores.outcomes, points_mm, camera)
+    >>> bool(errors.rotation_deg[0] < 0.001)
+    True
     """
-    truth, k = rows.truth, len(points_mm)
+    truth, k = outcomes.truth, len(points_mm)
     counts = np.diff(truth.offsets)
     if np.any(counts != k):
         n = int(np.argmax(counts != k))
         raise DataError(f"image_id {truth.image_id[n]} has {counts[n]} keypoints, but the board has {k}")
-    places = np.stack([truth.keypoints["x"], truth.keypoints["y"]], axis=1).astype(np.float64).reshape(-1, k, 2)
-    found = rows.detection.reshape(-1, k)
+    true_xy = outcomes.truth_points.xy.reshape(-1, k, 2)
+    detection = outcomes.matches.detection.reshape(-1, k)
     translation, rotation = np.full(len(truth), np.nan), np.full(len(truth), np.nan)
-    for n in np.flatnonzero((found >= 0).sum(axis=1) >= LEAST_POINTS).tolist():
-        seen = found[n] >= 0
-        R_true, t_true = _pose(points_mm, places[n], camera)
-        R, t = _pose(points_mm[seen], rows.xy[found[n][seen]], camera)
+    for n in np.flatnonzero((detection >= 0).sum(axis=1) >= LEAST_POINTS).tolist():
+        matched = detection[n] >= 0
+        R_true, t_true = _estimate_pose(points_mm, true_xy[n], camera)
+        R, t = _estimate_pose(points_mm[matched], outcomes.detections.xy[detection[n][matched]], camera)
         translation[n] = 100 * np.linalg.norm(t - t_true) / np.linalg.norm(t_true)
         # arctan2 of sine and cosine: arccos of the trace alone cannot tell small angles from none
         turn = R @ R_true.T
@@ -111,8 +174,11 @@ def pose_errors(rows: Tally, points_mm: Float, camera: Camera) -> PoseErrors:
     return PoseErrors(translation, rotation)
 
 
-def _pose(points_mm: Float, xy: Float, camera: Camera) -> tuple[Float, Float]:
-    """Rotation (3, 3) and translation (3,) in mm, board to camera: the plane's better pose, refined."""
+def _estimate_pose(points_mm: Float, xy: Float, camera: Camera) -> tuple[Float, Float]:
+    """Return the rotation (3, 3) and the translation (3,) in mm from the board's frame to the camera's.
+
+    IPPE gives the better of the plane's two poses, Levenberg-Marquardt refines it.
+    """
     import cv2
 
     points, pixels = np.ascontiguousarray(points_mm), np.ascontiguousarray(xy)

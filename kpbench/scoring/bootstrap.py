@@ -1,10 +1,17 @@
-"""95 % intervals from a bootstrap over scenes: images of one scene are not independent, so scenes are drawn.
+"""95 % intervals from a bootstrap over scenes.
 
-With few scenes percentile intervals are too narrow and off centre. They lack the factor C/(C - 1) of a variance and the
-tails of Student's t; both are put into the percentiles (Hesterberg 2015, "What teachers should know about the
-bootstrap", section on expanded percentiles). Bias and skewness shift the percentiles (BC_a: Efron 1987, "Better
-bootstrap confidence intervals").
-``benchmarks/accuracy/coverage.py`` measures how often the intervals hold the truth.
+Images of one scene are not independent, so whole scenes are drawn with replacement.
+
+Plain percentile intervals of few scenes are too narrow and off centre. Three corrections change the percentiles:
+the factor C/(C - 1) that a variance of C scenes lacks and the tails of Student's t [1]_, and a shift for bias and
+skewness, BC_a [2]_. ``benchmarks/accuracy/coverage.py`` measures how often the intervals hold the truth.
+
+References
+----------
+.. [1] T. C. Hesterberg, "What teachers should know about the bootstrap", The American Statistician 69(4), 2015,
+   section on expanded percentiles. https://doi.org/10.1080/00031305.2015.1089789
+.. [2] B. Efron, "Better bootstrap confidence intervals", Journal of the American Statistical Association 82(397), 1987.
+   https://doi.org/10.1080/01621459.1987.10478410
 """
 
 from __future__ import annotations
@@ -19,82 +26,124 @@ from scipy.special import ndtr, ndtri, stdtrit
 from kpbench.types import Float, Int
 
 Interval = tuple[float, float]
-MOST_KINDS = 1000  # different scenes that a bootstrap tells apart
+"""Lower and upper bound."""
+MOST_KINDS = 1000
+"""Number of different scenes that are drawn one by one; more of them are pooled."""
 
 
-def by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
-    """Sums of shape (N, M) of images, added up within scenes: (C, M), in the order of the scenes' numbers."""
+def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
+    """Add up the counts of images of equal scene.
+
+    Parameters
+    ----------
+    sums : ndarray of shape (N, M)
+        Counts per image.
+    scene : ndarray of shape (N,), int64
+        Number of each image's scene.
+
+    Returns
+    -------
+    ndarray of shape (C, M)
+        Counts per scene, in the order of the scenes' numbers.
+    """
     order = np.argsort(scene, kind="stable")
     starts = np.flatnonzero(np.append(True, np.diff(scene[order]) != 0)[: len(order)])
     return sums if len(starts) == len(sums) else np.add.reduceat(sums[order], starts)
 
 
-def intervals(
+def bootstrap_intervals(
     sums: NDArray[Any], statistics: Callable[[Float], Mapping[str, Float]], resamples: int, seed: int
 ) -> dict[str, Interval | None]:
-    """Expanded BC_a intervals of statistics of the summed rows, when rows are drawn with replacement.
+    """Compute 95 % intervals of statistics of summed counts, by drawing scenes with replacement.
 
-    Drawing C scenes with replacement is drawing how often each *kind* of scene (equal sums) comes up, a multinomial;
-    so a million scenes cost as much as the few hundred different ones among them.
+    Scenes of equal counts are of one kind. Drawing C scenes is drawing a number of scenes of each kind, a multinomial.
+    So a million scenes cost as much as the few hundred kinds among them.
 
     Parameters
     ----------
-    sums : ndarray of shape (C, M), a row a scene, whole numbers.
+    sums : ndarray of shape (C, M)
+        Counts per scene, whole numbers.
     statistics : function
-        From (..., M) sums to named values of shape (...), nan where undefined.
+        Computes named values of shape (...) from sums of shape (..., M); nan where a value is undefined.
     resamples : int
-        None at all gives no intervals.
+        Number of resamples. 0 computes no intervals.
     seed : int
+        Seed of the draws.
 
     Returns
     -------
     dict of str to (low, high) or None
-        None where there are fewer than two scenes, or where the value is undefined in all resamples.
+        None for fewer than two scenes, and for a value that is undefined in all resamples.
+
+    Examples
+    --------
+    >>> import numpy as np, kpbench
+    >>> sums = np.array([[3, 4], [4, 4], [2, 4], [4, 4]])  # matches and true keypoints of four scenes
+    >>> found = kpbench.scoring.bootstrap_intervals(sums, lambda s: {"score": s[..., 0] / s[..., 1]}, 1000, seed=0)
+    >>> low, high = found["score"]
+    >>> 0.4 < low < 13 / 16 < high <= 1
+    True
     """
     if len(sums) < 2 or not resamples:
         return dict.fromkeys(statistics(sums.sum(axis=0)))
-    kinds, many = _unique_rows(sums)
+    kinds, count = _unique_rows(sums)
     rng = np.random.default_rng(seed)
-    if len(kinds) > MOST_KINDS:  # pool scenes at random: the sums of equal-sized pools vary as much
-        shuffled = np.repeat(kinds, many, axis=0)[rng.permutation(len(sums))]
+    if len(kinds) > MOST_KINDS:  # pool scenes at random: sums of equally large pools vary as much as sums of scenes
+        shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
-        many = np.ones(MOST_KINDS, np.int64)
-    drawn = rng.multinomial(many.sum(), many / many.sum(), size=resamples)
-    total = many @ kinds
-    found, without = statistics(total), statistics(total - kinds)  # without one scene of each kind, for the skewness
+        count = np.ones(MOST_KINDS, np.int64)
+    drawn = rng.multinomial(count.sum(), count / count.sum(), size=resamples)
+    total = count @ kinds
+    found, without_one = statistics(total), statistics(total - kinds)
     result: dict[str, Interval | None] = {}
     for name, values in statistics(drawn.astype(float) @ kinds).items():
         values = values[np.isfinite(values)]
-        levels = _levels(values, float(found[name]), without[name], many, len(sums))
+        levels = _percentile_levels(values, float(found[name]), without_one[name], count, len(sums))
         low, high = np.quantile(values, levels).tolist() if len(values) else (np.nan, np.nan)
         result[name] = (low, high) if len(values) else None
     return result
 
 
-def _levels(values: Float, found: float, without: Float, many: Int, scenes: int) -> Float:
-    """The two percentiles that make a 95 % interval: 0.025 and 0.975 for many scenes, without bias and skewness.
+def _percentile_levels(values: Float, found: float, without_one: Float, count: Int, scenes: int) -> Float:
+    """Return the two levels whose percentiles bound a 95 % interval.
 
-    ``values`` (R,) are those of the resamples, ``found`` is that of all scenes, ``without`` (K,) is that without one
-    scene of each kind, and ``many`` (K,) scenes are of the kind.
+    For many scenes without bias and skewness the levels are 0.025 and 0.975.
+
+    Parameters
+    ----------
+    values : ndarray of shape (R,), float64
+        The statistic of each resample.
+    found : float
+        The statistic of all scenes.
+    without_one : ndarray of shape (K,), float64
+        The statistic without one scene of each kind; its skewness is that of the jackknife.
+    count : ndarray of shape (K,), int64
+        Number of scenes of each kind.
+    scenes : int
+        Number of scenes.
     """
     half = -stdtrit(scenes - 1, 0.025) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
-    fine = np.isfinite(without)
-    if not len(values) or not fine.any():
+    defined = np.isfinite(without_one)
+    if not len(values) or not defined.any():
         return np.asarray(ndtr(half))
     below = np.mean(values < found) + np.mean(values == found) / 2
     bias = ndtri(np.clip(below, 0.5 / len(values), 1 - 0.5 / len(values)))
-    change, weight = np.average(without[fine], weights=many[fine]) - without[fine], many[fine]
+    weight = count[defined]
+    change = np.average(without_one[defined], weights=weight) - without_one[defined]
     spread = float(weight @ change**2)
     skew = float(weight @ change**3) / (6 * spread**1.5) if spread > 0 else 0.0
     return np.asarray(ndtr(bias + (bias + half) / (1 - skew * (bias + half))))
 
 
 def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:
-    """The different rows of a table of whole numbers, in a fixed order, and how often each is there."""
+    """Return the different rows of a table of whole numbers, in a fixed order, and the count of each.
+
+    The rows are packed into one integer each where they fit; that is many times faster than ``np.unique`` by rows.
+    """
     least = table.min(axis=0)
     sizes = (table.max(axis=0) - least).astype(object) + 1
     if np.prod(sizes) >= 2**62:
         return np.unique(table, axis=0, return_counts=True)
     shape = tuple(int(size) for size in sizes)
-    code, many = np.unique(np.ravel_multi_index(tuple((table - least).T), shape), return_counts=True)
-    return np.stack(np.unravel_index(code, shape), axis=1) + least, many
+    code, count = np.unique(np.ravel_multi_index(tuple((table - least).T), shape), return_counts=True)
+    return np.stack(np.unravel_index(code, shape), axis=1) + least, count

@@ -1,4 +1,4 @@
-"""Where along a severity ladder the detection score crosses a limit, interpolated, with an interval."""
+"""Find where the detection score crosses a limit as the severity of a condition grows."""
 
 from __future__ import annotations
 
@@ -9,30 +9,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.scoring.bootstrap import Interval, by_scene, intervals
+from kpbench.scoring.bootstrap import Interval, bootstrap_intervals, sum_by_scene
 from kpbench.scoring.metrics import SUMS
 from kpbench.scoring.scores import Scores
-from kpbench.types import Float
+from kpbench.types import Float, Int
 
-LIMIT = 0.9
-TRUTHS, MATCHED = SUMS.index("truths"), SUMS.index("matched")
+DETECTION_SCORE_LIMIT = 0.9
+"""The detection score whose crossing is a breakpoint, unless another is given."""
 
 
 @dataclass(frozen=True)
 class Breakpoint:
-    """The rung at which the detection score of a condition crosses ``limit``.
+    """The rung at which the detection score of a condition crosses a limit.
 
     Attributes
     ----------
     condition : str
     limit : float
     crossing : {"falls", "rises", "over", "under"}
-        Whether the score falls under or rises over the limit as the rung grows; "over" and "under": it is on that
-        side at all rungs.
+        "falls": the score falls under the limit as the rung grows. "rises": it rises to the limit. "over", "under": it
+        is on that side at all rungs.
     rung : float or None
-        The first such crossing, on straight lines between the rungs; None if there is none.
+        The first such crossing, on straight lines between the rungs; None for "over" and "under".
     interval : (low, high) or None
-        95 %, from resampled scenes. A resample that crosses before or after the ladder counts as that end of it.
+        95 % interval from resampled scenes. A resample that does not cross between the rungs counts as the first or
+        the last rung.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.scoring.Breakpoint("blur", 0.9, "falls", 7.5, (7.1, 8.2)).crossing
+    'falls'
     """
 
     condition: str
@@ -42,62 +49,82 @@ class Breakpoint:
     interval: Interval | None
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of ``breakpoints`` in the scores file."""
+        """Return an entry of ``breakpoints`` in the scores file."""
         return asdict(self)
 
 
-def breakpoints(scores: Scores, limit: float = LIMIT) -> tuple[Breakpoint, ...]:
-    """All crossings of every condition: at most one "falls" and one "rises" each.
+def find_breakpoints(scores: Scores, limit: float = DETECTION_SCORE_LIMIT) -> tuple[Breakpoint, ...]:
+    """Find all crossings of every condition.
 
     The detection score is that of one-to-one matching, whatever the settings.
+
+    Parameters
+    ----------
+    scores : Scores
+    limit : float
+        Detection score to be crossed.
+
+    Returns
+    -------
+    tuple of Breakpoint
+        For each condition at most one that "falls" and one that "rises"; or one that is "over" or "under".
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.scoring.find_breakpoints(scores)  # this dataset has no conditions
+    ()
     """
-    return tuple(b for name, rungs in scores.conditions.items() for b in _of_condition(scores, name, rungs, limit))
+    return tuple(b for name, rungs in scores.conditions.items() for b in _find_in_condition(scores, name, rungs, limit))
 
 
-def _of_condition(scores: Scores, name: str, rungs: list[float], limit: float) -> Iterator[Breakpoint]:
-    rows = scores.tally
-    units = _by_rung(rows.image_sums, rows.truth.scene_id, rows.truth.condition == name, rows.truth.rung, rungs)
+def _find_in_condition(scores: Scores, name: str, rungs: list[float], limit: float) -> Iterator[Breakpoint]:
+    scenes = _sums_by_rung(scores, name, rungs)
     levels = np.array(rungs, np.float64)
-    score = _detection_scores(units.sum(axis=0), len(rungs))
-    under = score < limit
-    if np.isfinite(score).all() and (under.all() or not under.any()):
+    detection_score = _detection_scores(scenes.sum(axis=0), len(rungs))
+    under = detection_score < limit
+    if np.isfinite(detection_score).all() and (under.all() or not under.any()):
         yield Breakpoint(name, limit, "under" if under[0] else "over", None, None)
     for crossing, rising in (("falls", False), ("rises", True)):
-        at = float(_first_crossing(levels, score, limit, rising))
-        if np.isnan(at):
+        rung = float(_first_crossing(levels, detection_score, limit, rising))
+        if np.isnan(rung):
             continue
 
-        def resampled(sums: NDArray[Any], rising: bool = rising) -> dict[str, Float]:
+        def crossing_rung(sums: NDArray[Any], rising: bool = rising) -> dict[str, Float]:
             values = _detection_scores(sums, len(levels))
-            outside = np.where((values[..., 0] < limit) != rising, levels[0], levels[-1])
-            crossed = _first_crossing(levels, values, limit, rising)
-            return {"rung": np.where(np.isnan(crossed), outside, crossed)}
+            end = np.where((values[..., 0] < limit) != rising, levels[0], levels[-1])
+            found = _first_crossing(levels, values, limit, rising)
+            return {"rung": np.where(np.isnan(found), end, found)}
 
-        spread = intervals(units, resampled, scores.settings.resamples, scores.settings.seed)["rung"]
-        yield Breakpoint(name, limit, crossing, at, spread)
+        settings = scores.settings
+        interval = bootstrap_intervals(scenes, crossing_rung, settings.resamples, settings.seed)["rung"]
+        yield Breakpoint(name, limit, crossing, rung, interval)
 
 
-def _by_rung(
-    sums: NDArray[np.int64], scene: NDArray[np.int64], of_condition: NDArray[np.bool_], rung: Float, rungs: list[float]
-) -> NDArray[np.int64]:
-    """(C, 2R) sums of each scene: truths and matches at the first rung, at the second, …"""
-    rows = np.flatnonzero(of_condition)
-    step = np.searchsorted(rungs, rung[rows])
-    wide = np.zeros((len(rows), 2 * len(rungs)), np.int64)
-    wide[np.arange(len(rows)), 2 * step] = sums[rows, TRUTHS]
-    wide[np.arange(len(rows)), 2 * step + 1] = sums[rows, MATCHED]
-    return by_scene(wide, scene[rows])
+def _sums_by_rung(scores: Scores, condition: str, rungs: list[float]) -> Int:
+    """Return (C, 2R) counts per scene of a condition: true keypoints and matches at the first rung, the second, …"""
+    truth, sums = scores.outcomes.truth, scores.outcomes.image_sums
+    images = np.flatnonzero(truth.condition == condition)
+    position = np.searchsorted(rungs, truth.rung[images])
+    table = np.zeros((len(images), 2 * len(rungs)), np.int64)
+    table[np.arange(len(images)), 2 * position] = sums[images, SUMS.index("truths")]
+    table[np.arange(len(images)), 2 * position + 1] = sums[images, SUMS.index("matched")]
+    return sum_by_scene(table, truth.scene_id[images])
 
 
 def _detection_scores(sums: NDArray[Any], rungs: int) -> Float:
-    """(…, R) from (…, 2R) sums; nan where a rung has no keypoints."""
+    """Compute (..., R) detection scores from (..., 2R) sums; nan where a rung has no keypoints."""
     pairs = sums.reshape(*sums.shape[:-1], rungs, 2).astype(np.float64)
     truths = np.where(pairs[..., 0] > 0, pairs[..., 0], np.nan)
     return np.asarray(pairs[..., 1] / truths)
 
 
 def _first_crossing(levels: Float, value: Float, limit: float, rising: bool) -> Float:
-    """Where values of shape (…, R) first fall under (or rise to) a limit between two levels; nan where they do not."""
+    """Return where values of shape (..., R) first fall under a limit, or rise to it; nan where they do not.
+
+    The values are those at ``levels`` (R,). Between two levels they lie on a straight line.
+    """
     if len(levels) < 2:
         return np.full(value.shape[:-1], np.nan)
     before, after = value[..., :-1], value[..., 1:]
@@ -106,5 +133,5 @@ def _first_crossing(levels: Float, value: Float, limit: float, rising: bool) -> 
     a, b = np.take_along_axis(before, k, axis=-1)[..., 0], np.take_along_axis(after, k, axis=-1)[..., 0]
     k = k[..., 0]
     with np.errstate(invalid="ignore", divide="ignore"):
-        at = levels[k] + (levels[k + 1] - levels[k]) * (limit - a) / (b - a)
-    return np.asarray(np.where(crosses.any(axis=-1), at, np.nan))
+        crossing = levels[k] + (levels[k + 1] - levels[k]) * (limit - a) / (b - a)
+    return np.asarray(np.where(crosses.any(axis=-1), crossing, np.nan))

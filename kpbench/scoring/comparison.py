@@ -1,4 +1,4 @@
-"""Two detectors on the same images: paired differences with intervals, and who wins where."""
+"""Compare two detectors on the same images: paired differences with intervals, and which detector is better."""
 
 from __future__ import annotations
 
@@ -10,28 +10,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, GateFailed
-from kpbench.scoring.bootstrap import Interval, by_scene, intervals
-from kpbench.scoring.metrics import LABELS, PAPER_METRICS, SUMS, ratios
+from kpbench.scoring.bootstrap import Interval, bootstrap_intervals, sum_by_scene
+from kpbench.scoring.metrics import LABELS, PAPER_METRICS, SUMS, compute_ratios
 from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
-METRICS = (*PAPER_METRICS, "precision", "f1")
+COMPARED_METRICS = (*PAPER_METRICS, "precision", "f1")
+"""Names of the metrics that are compared."""
 LOWER_IS_BETTER = ("average_false_alarm",)
+"""Names of the metrics whose lower value is the better one."""
 
 
 @dataclass(frozen=True)
 class Difference:
-    """First minus second of one metric, over all images or those of one condition and rung.
+    """The first detector's metric minus the second's, over all images or those of one condition and rung.
 
     Attributes
     ----------
-    condition, rung
+    condition : str or None
+        None for all images.
+    rung : float or None
         None for all images.
     metric : str
+        One of :data:`COMPARED_METRICS`.
     first, second : float or None
-        None where undefined; then so is the difference.
+        The metric of each detector; None where undefined.
     interval : (low, high) or None
-        95 % of the difference, from scenes resampled for both alike; None with fewer than two scenes.
+        95 % interval of the difference, from scenes resampled for both detectors alike. None for fewer than two
+        scenes.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> difference = kpbench.scoring.Difference("blur", 7, "detection_score", 0.75, 0.5, (0.1, 0.4))
+    >>> difference.value, difference.verdict
+    (0.25, 'better')
     """
 
     condition: str | None
@@ -43,52 +56,83 @@ class Difference:
 
     @property
     def value(self) -> float | None:
-        """First minus second."""
+        """First minus second; None if one of the two is undefined."""
         return None if self.first is None or self.second is None else self.first - self.second
 
     @property
     def verdict(self) -> str:
-        """Whether the first is "better" or "worse", or "even": the interval holds 0, or there is none."""
+        """Whether the first is "better" or "worse"; "even" where the interval holds 0 or is None."""
         if self.value is None or self.interval is None or self.interval[0] <= 0 <= self.interval[1]:
             return "even"
         return "better" if (self.value > 0) != (self.metric in LOWER_IS_BETTER) else "worse"
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of ``differences`` in the comparison file."""
+        """Return an entry of ``differences`` in the comparison file."""
         return {**vars(self), "difference": self.value, "verdict": self.verdict}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The first detector against one other; ``differences`` begin with those over all images."""
+    """The differences of two detectors.
+
+    Attributes
+    ----------
+    first, second : str
+        Names of the detectors.
+    differences : tuple of Difference
+        Those over all images, then those of each condition and rung.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.compare(scores, scores).verdicts("detection_score")
+    {'better': 0, 'even': 1, 'worse': 0}
+    """
 
     first: str
     second: str
     differences: tuple[Difference, ...]
 
     def verdicts(self, metric: str) -> dict[str, int]:
-        """How often the first is better, even and worse over the rungs, or over all images if there are none."""
-        of_metric = [d for d in self.differences if d.metric == metric]
-        said = [d.verdict for d in of_metric[1:] or of_metric]
-        return {verdict: said.count(verdict) for verdict in ("better", "even", "worse")}
+        """Count how often the first is better, even and worse over the rungs; over all images if there are no rungs."""
+        overall, *of_rungs = (d.verdict for d in self.differences if d.metric == metric)
+        found = of_rungs or [overall]
+        return {verdict: found.count(verdict) for verdict in ("better", "even", "worse")}
 
     def to_dict(self) -> dict[str, Any]:
-        """An entry of ``comparisons`` in the comparison file."""
+        """Return an entry of ``comparisons`` in the comparison file."""
         return {"first": self.first, "second": self.second, "differences": [d.to_dict() for d in self.differences]}
 
 
 def compare(first: Scores, second: Scores) -> Comparison:
-    """Paired differences of the paper's metrics, precision and F1.
+    """Compute paired differences of the paper's metrics, precision and F1.
 
-    Both are resampled together, scene by scene, so what makes a scene hard for both does not widen the interval. The
-    settings are those of ``first``.
+    Each resample draws the same scenes for both detectors. A scene that is hard for both then does not widen the
+    interval of the difference.
+
+    Parameters
+    ----------
+    first, second : Scores
+        Scores on the same truth with the same settings.
+
+    Returns
+    -------
+    Comparison
 
     Raises
     ------
     DataError
-        If the two were not scored on the same truth with the same settings.
+        If the truth or the settings of the two scores differ.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.compare(scores, scores).differences[0].value
+    0.0
     """
-    a, b = first.tally, second.tally
+    a, b = first.outcomes, second.outcomes
     same = a.truth is b.truth or (
         a.truth.fingerprint == b.truth.fingerprint
         and np.array_equal(a.truth.image_id, b.truth.image_id)
@@ -96,40 +140,47 @@ def compare(first: Scores, second: Scores) -> Comparison:
     )
     if not same or a.settings != b.settings:
         raise DataError(f"{first.name} and {second.name} were not scored on the same images with the same settings")
-    return Comparison(first.name, second.name, tuple(_differences(first, second)))
+    return Comparison(first.name, second.name, tuple(_compute_differences(first, second)))
 
 
-def _differences(first: Scores, second: Scores) -> Iterator[Difference]:
-    truth, settings = first.tally.truth, first.settings
-    both = np.hstack([first.tally.image_sums, second.tally.image_sums])
-    width = len(SUMS)
+def _compute_differences(first: Scores, second: Scores) -> Iterator[Difference]:
+    truth, settings = first.outcomes.truth, first.settings
+    both = np.hstack([first.outcomes.image_sums, second.outcomes.image_sums])
     undefined = {n for run in (first, second) for n, value in run.overall.metrics.items() if value is None}
 
-    def parts(sums: NDArray[Any]) -> tuple[dict[str, Float], dict[str, Float]]:
-        return ratios(sums[..., :width], settings.matching), ratios(sums[..., width:], settings.matching)
+    def ratios_of_both(sums: NDArray[Any]) -> tuple[dict[str, Float], dict[str, Float]]:
+        parts = sums[..., : len(SUMS)], sums[..., len(SUMS) :]
+        return compute_ratios(parts[0], settings.matching), compute_ratios(parts[1], settings.matching)
 
     def difference(sums: NDArray[Any]) -> dict[str, Float]:
-        one, other = parts(sums)
-        return {name: one[name] - other[name] for name in METRICS}
+        one, other = ratios_of_both(sums)
+        return {name: one[name] - other[name] for name in COMPARED_METRICS}
 
     keys = [(None, None), *((name, rung) for name, rungs in first.conditions.items() for rung in rungs)]
     for condition, rung in keys:
         rows = np.ones(len(truth), bool) if condition is None else (truth.condition == condition) & (truth.rung == rung)
-        units = by_scene(both[rows], truth.scene_id[rows])
-        spread = intervals(units, difference, settings.resamples, settings.seed)
-        one, other = parts(units.sum(axis=0))
-        for name in METRICS:
+        scenes = sum_by_scene(both[rows], truth.scene_id[rows])
+        intervals = bootstrap_intervals(scenes, difference, settings.resamples, settings.seed)
+        one, other = ratios_of_both(scenes.sum(axis=0))
+        for name in COMPARED_METRICS:
             a, b = (None if name in undefined or np.isnan(v[name]) else float(v[name]) for v in (one, other))
-            yield Difference(condition, rung, name, a, b, None if a is None or b is None else spread[name])
+            yield Difference(condition, rung, name, a, b, None if a is None or b is None else intervals[name])
 
 
 def check_regression(comparisons: Sequence[Comparison]) -> None:
-    """Refuse a first detector that is worse than another over all images, in any of the paper's three metrics.
+    """Refuse a first detector that is worse than another over all images, in one of the paper's three metrics.
 
     Raises
     ------
     GateFailed
-        Naming every such metric, with the interval of its difference; or that there are too few scenes to tell.
+        If a metric is worse, or differs where all images are of one scene and have no interval. The message names
+        every such metric.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.scoring.check_regression([kpbench.compare(scores, scores)])
     """
     failed = []
     for c in comparisons:
@@ -142,9 +193,9 @@ def check_regression(comparisons: Sequence[Comparison]) -> None:
                     "and one scene cannot tell whether by chance"
                 )
             if d.verdict == "worse" and d.interval:
-                span = f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
                 failed.append(
-                    f"{LABELS[d.metric]} of {c.first} is worse than that of {c.second} by {d.value:+.4f} {span}"
+                    f"{LABELS[d.metric]} of {c.first} is worse than that of {c.second} by {d.value:+.4f} "
+                    f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
                 )
     if failed:
         raise GateFailed("; ".join(failed))

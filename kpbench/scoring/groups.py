@@ -1,4 +1,4 @@
-"""Groups of images and keypoints, and the metrics of each."""
+"""Divide images and keypoints into groups, and compute the metrics of each group."""
 
 from __future__ import annotations
 
@@ -11,47 +11,82 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.scoring.assignment import MATCHED
-from kpbench.scoring.bootstrap import Interval, by_scene, intervals
-from kpbench.scoring.metrics import COUNTS, METRICS, SUMS, error_metrics, precision_recall, ratios
-from kpbench.scoring.outcomes import Tally
+from kpbench.scoring.bootstrap import Interval, bootstrap_intervals, sum_by_scene
+from kpbench.scoring.metrics import (
+    COUNTS,
+    METRICS,
+    SUMS,
+    compute_average_precision,
+    compute_error_metrics,
+    compute_ratios,
+)
+from kpbench.scoring.outcomes import Outcomes
 from kpbench.types import Int
 
-RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)  # bins are low < radius <= high
+RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)
+"""Edges of the bins of radii, px: low < radius <= high."""
+_NEED_DETECTIONS = {"average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"} | {
+    "detections",
+    "duplicate",
+    "near_miss",
+    "clutter",
+}
+"""Metrics and counts that are undefined where detections cannot be divided among the groups."""
+_NEED_IDS = {"id_matching_score", "id_matching_score_literal", "id_correct", "wrong_id", "id_correct_literal"}
+"""Metrics and counts that are undefined for a detector without identities."""
 
 
-_OF_DETECTIONS = {"average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"}
+class GroupKey(NamedTuple):
+    """The condition, rung, patch and radii of a group; None stands for all.
 
+    Attributes
+    ----------
+    condition : str or None
+        Name of the experiment.
+    rung : float or None
+        Severity within the condition.
+    patch_id : int or None
+        Identity of the true keypoints.
+    radius_px : (low, high) or None
+        Radii of the true keypoints, low < radius <= high; a ``high`` of None is no limit.
 
-_OF_IDS = {"id_matching_score", "id_matching_score_literal"}
-
-
-class Key(NamedTuple):
-    """What a group is of; None stands for all."""
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.scoring.GroupKey("blur", 7).patch_id is None
+    True
+    """
 
     condition: str | None = None
     rung: float | None = None
     patch_id: int | None = None
-    radius_px: tuple[float, float | None] | None = None  # low < radius <= high, None for no limit
+    radius_px: tuple[float, float | None] | None = None
 
 
 @dataclass(frozen=True)
 class Group:
-    """Metrics of some of the images, or of some keypoints in them.
+    """The metrics of some of the images, or of some keypoints in them.
 
     Attributes
     ----------
-    key : Key
-        ``condition``, ``rung``, ``patch_id`` and ``radius_px`` of the group, each also an attribute of its own.
+    key : GroupKey
+        Its first three fields are attributes of the group too.
     metrics : dict of str to float or None
-        The names of :data:`kpbench.scoring.METRICS`; None where a metric is undefined (0/0) or the group does not
-        have it.
+        The names of :data:`kpbench.scoring.METRICS`; None where a metric is undefined for the group.
     counts : dict of str to int or None
-        The names of :data:`kpbench.scoring.COUNTS`; None as above.
+        The names of :data:`kpbench.scoring.COUNTS`; None where a count is undefined for the group.
     intervals : dict of str to (low, high) or None
         95 % bootstrap intervals of the metrics that are ratios of counts.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> scores.overall.metrics["precision"], scores.overall.counts["missed"]
+    (1.0, 1)
     """
 
-    key: Key
+    key: GroupKey
     metrics: dict[str, float | None]
     counts: dict[str, int | None]
     intervals: dict[str, Interval | None]
@@ -72,116 +107,149 @@ class Group:
         return self.key.patch_id
 
     def to_dict(self) -> dict[str, Any]:
-        """The group's ``metrics`` object of the scores file."""
+        """Return the group's ``metrics`` object of the scores file."""
         return {**self.metrics, "counts": self.counts, "intervals": self.intervals}
 
 
-class _Rows(NamedTuple):
-    """What groups are cut from: M rows (images, or keypoints of one kind in them) of a tally."""
+class _Units(NamedTuple):
+    """The M units that groups consist of: images, or the keypoints of one label in one image."""
 
-    tally: Tally
-    sums: Int  # (M, 9)
-    scene: Int  # (M,)
-    of_truth: Int  # (T,) the row of each
-    of_detection: Int  # (D,) the row of each, or -1
-    mixed: NDArray[np.bool_]  # (M,) whether detections cannot be told to belong to the row
+    outcomes: Outcomes
+    sums: Int
+    """Counts of each unit, of shape (M, 9), in the order of SUMS."""
+    scene: Int
+    """Scene of each unit, of shape (M,)."""
+    of_truth: Int
+    """Unit of each true keypoint, of shape (T,)."""
+    of_detection: Int
+    """Unit of each detection, or -1, of shape (D,)."""
+    shared: NDArray[np.bool_]
+    """Whether the unit's image has other units, so that its false alarms belong to no unit, of shape (M,)."""
 
-    def cut(self, keys: list[Key], label: Int) -> Iterator[Group]:
-        """A group for each key; ``label`` (M,) is the place in ``keys`` of each row."""
-        labelled = np.append(label, -1)
-        whole = np.bincount(label, self.mixed, minlength=len(keys)) == 0
-        parts = [_split(part, len(keys)) for part in (label, labelled[self.of_truth], labelled[self.of_detection])]
-        for key, r, t, d, fine in zip(keys, *parts, whole.tolist(), strict=True):
-            yield self._group(key, self.sums[r], self.scene[r], t, d, fine)
+    def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
+        """Compute a group for each key; ``label`` (M,) is the position in ``keys`` of each unit."""
+        label_or_none = np.append(label, -1)  # a unit of -1 has the label -1
+        any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
+        labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
+        rows = [_rows_of_labels(part, len(keys)) for part in labels]
+        for key, units, truths, detections, shared in zip(keys, *rows, any_shared.tolist(), strict=True):
+            yield self._compute(key, units, truths, detections, shared)
 
-    def _group(self, key: Key, sums: Int, scene: Int, truths: Int, detections: Int, whole: bool) -> Group:
-        rows, settings = self.tally, self.tally.settings
+    def _compute(self, key: GroupKey, units: Int, truths: Int, detections: Int, shared: bool) -> Group:
+        outcomes, settings = self.outcomes, self.outcomes.settings
+        sums = self.sums[units]
         total = sums.sum(axis=0)
-        metrics: dict[str, float | None] = {
-            name: None if np.isnan(value) else float(value) for name, value in ratios(total, settings.matching).items()
-        }
-        hit = rows.kind[detections] == MATCHED
-        metrics["average_precision"] = precision_recall(rows.score[detections], hit, int(total[1]))[0]
-        truths = truths[rows.matched[truths]]
-        metrics |= error_metrics(rows.distance[truths], rows.radius[truths])
-        units = by_scene(sums, scene)
-        spread = intervals(units, lambda s: ratios(s, settings.matching), settings.resamples, settings.seed)
+        ratios = compute_ratios(total, settings.matching)
+        metrics = {name: None if np.isnan(value) else float(value) for name, value in ratios.items()}
+        hit = outcomes.matches.kind[detections] == MATCHED
         n: dict[str, Any] = dict(zip(SUMS, total.tolist(), strict=True))
+        score = outcomes.detections.score[detections]
+        metrics["average_precision"] = compute_average_precision(score, hit, n["truths"])
+        matched = truths[outcomes.matched[truths]]
+        metrics |= compute_error_metrics(outcomes.matches.distance[matched], outcomes.truth_points.radius[matched])
+        scenes = sum_by_scene(sums, self.scene[units])
+        intervals = bootstrap_intervals(
+            scenes, lambda s: compute_ratios(s, settings.matching), settings.resamples, settings.seed
+        )
         n |= {
-            "scenes": len(units),
+            "scenes": len(scenes),
             "wrong_id": n["matched"] - n["id_correct"],
             "missed": n["truths"] - n["matched"],
             "clutter": n["detections"] - n["matched"] - n["duplicate"] - n["near_miss"],
         }
-        void = (set() if whole else _OF_DETECTIONS | {"detections", "duplicate", "near_miss", "clutter"}) | (
-            _OF_IDS | {"id_correct", "wrong_id", "id_correct_literal"} if rows.patch_id is None else set()
+        undefined = (_NEED_DETECTIONS if shared else set()) | (
+            _NEED_IDS if outcomes.detections.patch_id is None else set()
         )
         return Group(
             key,
-            metrics={name: None if name in void else metrics[name] for name in METRICS},
-            counts={name: None if name in void else n[name] for name in COUNTS},
-            intervals={name: None if name in void else value for name, value in spread.items()},
+            metrics={name: None if name in undefined else metrics[name] for name in METRICS},
+            counts={name: None if name in undefined else n[name] for name in COUNTS},
+            intervals={name: None if name in undefined else value for name, value in intervals.items()},
         )
 
 
-def make_groups(rows: Tally) -> Iterator[Group]:
-    """Overall; each condition and rung; each patch within them and over all images; each bin of radii."""
-    truth, n = rows.truth, len(rows.truth)
-    images = _Rows(rows, rows.image_sums, truth.scene_id, rows.truth_image, rows.image, np.zeros(n, bool))
-    yield from images.cut([Key()], np.zeros(n, np.int64))
+def make_groups(outcomes: Outcomes) -> Iterator[Group]:
+    """Compute all groups of a score.
+
+    Yields
+    ------
+    Group
+        First all images. Then each condition and rung; each patch within each condition and rung; each patch over all
+        images; and each bin of radii over all images. A division into one part only is left out.
+    """
+    truth, n = outcomes.truth, len(outcomes.truth)
+    image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image
+    images = _Units(
+        outcomes, outcomes.image_sums, truth.scene_id, image_of_truth, image_of_detection, np.zeros(n, bool)
+    )
+    yield from images.group([GroupKey()], np.zeros(n, np.int64))
 
     conditions, condition = np.unique(truth.condition, return_inverse=True)
     rungs, rung = np.unique(truth.rung, return_inverse=True)
     codes, code = np.unique(condition * len(rungs) + rung, return_inverse=True)
-    keys = [Key(str(conditions[c // len(rungs)]) or None, _whole(rungs[c % len(rungs)])) for c in codes]
-    parted = keys != [Key()]
-    if parted:  # images without a condition, beside others that have one, are no group: it would read as all of them
-        yield from (group for group in images.cut(keys, code) if group.key != Key())
+    keys = [GroupKey(str(conditions[c // len(rungs)]) or None, _as_written(rungs[c % len(rungs)])) for c in codes]
+    has_conditions = keys != [GroupKey()]
+    if has_conditions:  # images without condition beside others are no group: their key would read as all images
+        yield from (group for group in images.group(keys, code) if group.key != GroupKey())
 
-    patches, patch = np.unique(rows.truth_id, return_inverse=True)
+    patches, patch = np.unique(outcomes.truth_id, return_inverse=True)
     if len(patches) > 1:
-        of_image, of_patch, units = _units(rows, patch, len(patches))
-        if parted:
+        of_image, of_patch, units = _divide_images(outcomes, patch, len(patches))
+        if has_conditions:
             codes, label = np.unique(code[of_image] * len(patches) + of_patch, return_inverse=True)
             both = [keys[c // len(patches)]._replace(patch_id=int(patches[c % len(patches)])) for c in codes]
-            yield from (group for group in units.cut(both, label) if group.key._replace(patch_id=None) != Key())
-        yield from units.cut([Key(patch_id=int(p)) for p in patches], of_patch)
+            groups = units.group(both, label)
+            yield from (group for group in groups if group.key._replace(patch_id=None) != GroupKey())
+        yield from units.group([GroupKey(patch_id=int(p)) for p in patches], of_patch)
 
-    bins, size = np.unique(np.searchsorted(RADIUS_EDGES_PX, rows.radius) - 1, return_inverse=True)
+    bin_of_truth = np.searchsorted(RADIUS_EDGES_PX, outcomes.truth_points.radius) - 1
+    bins, size = np.unique(bin_of_truth, return_inverse=True)
     if len(bins) > 1:
-        _, of_size, units = _units(rows, size, len(bins))
+        _, of_size, units = _divide_images(outcomes, size, len(bins))
         edges = [(RADIUS_EDGES_PX[b], RADIUS_EDGES_PX[b + 1]) for b in bins]
-        spans = [(low, None if np.isinf(high) else high) for low, high in edges]
-        yield from units._replace(mixed=np.ones(len(of_size), bool)).cut([Key(radius_px=s) for s in spans], of_size)
+        radii = [(low, None if np.isinf(high) else high) for low, high in edges]
+        units = units._replace(shared=np.ones(len(of_size), bool))  # a false alarm has no radius
+        yield from units.group([GroupKey(radius_px=span) for span in radii], of_size)
 
 
-def _units(rows: Tally, label: Int, labels: int) -> tuple[Int, Int, _Rows]:
-    """Keypoints of one label in one image as rows; gives their images, their labels, and the rows.
+def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, Int, _Units]:
+    """Divide each image into units of keypoints of one label.
 
-    A false alarm has no label of its own: it belongs to the label of the image's keypoints if they share one.
+    A false alarm has no label. It belongs to the image's unit if the image has only one, else to none.
+
+    Parameters
+    ----------
+    label : ndarray of shape (T,), int64
+        Label of each true keypoint, from 0 to ``labels`` - 1.
+
+    Returns
+    -------
+    of_image, of_label : ndarray of shape (M,), int64
+        Image and label of each unit.
+    units : _Units
     """
-    n = len(rows.truth)
-    unit, of_truth = np.unique(rows.truth_image * labels + label, return_inverse=True)
+    n = len(outcomes.truth)
+    unit, of_truth = np.unique(outcomes.truth_points.image * labels + label, return_inverse=True)
     of_image, of_label = unit // labels, unit % labels
-    mixed = (np.bincount(of_image, minlength=n) > 1)[of_image]
-    owner = np.full(n, -1)
-    owner[of_image[~mixed]] = np.flatnonzero(~mixed)
-    of_detection = owner[rows.image]
-    sums = rows.sums(of_truth, of_detection, len(unit))
-    return of_image, of_label, _Rows(rows, sums, rows.truth.scene_id[of_image], of_truth, of_detection, mixed)
+    shared = (np.bincount(of_image, minlength=n) > 1)[of_image]
+    unit_of_image = np.full(n, -1)
+    unit_of_image[of_image[~shared]] = np.flatnonzero(~shared)
+    of_detection = unit_of_image[outcomes.detections.image]
+    sums = outcomes.sum_rows(of_truth, of_detection, len(unit))
+    return of_image, of_label, _Units(outcomes, sums, outcomes.truth.scene_id[of_image], of_truth, of_detection, shared)
 
 
-def _split(label: Int, groups: int) -> list[Int]:
-    """Rows of each label 0 … groups - 1, in their order; others are left out."""
-    if groups < 2**15:
-        label = label.astype(np.int16)  # which numpy sorts in linear time
+def _rows_of_labels(label: Int, labels: int) -> list[Int]:
+    """Return the rows of each label from 0 to ``labels`` - 1, rising. Rows of other labels are left out."""
+    if labels < 2**15:
+        label = label.astype(np.int16)  # numpy sorts 16 bits in linear time
     order = np.argsort(label, kind="stable")
-    edges = np.searchsorted(label[order], np.arange(groups + 1))
+    edges = np.searchsorted(label[order], np.arange(labels + 1))
     return [order[a:b] for a, b in pairwise(edges.tolist())]
 
 
-def _whole(rung: float) -> float | None:
-    """A rung as it is written: 15, not 15.0; None for nan."""
+def _as_written(rung: float) -> float | None:
+    """Return a rung as suites write it: 15 rather than 15.0; None for nan."""
     if np.isnan(rung):
         return None
     return int(rung) if float(rung).is_integer() else float(rung)

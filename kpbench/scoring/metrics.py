@@ -1,7 +1,7 @@
-"""Numbers from counts: the only place where sums become metrics. Nothing here knows images or files.
+"""Compute metrics from counts. Nothing in this module knows images or files.
 
-What is 0/0 is undefined: nan in arrays here, None in results, never 0 or 1. ``docs/reference/metrics.md`` describes
-each metric with its edge cases.
+A metric that would be 0/0 is undefined. An undefined metric is nan in arrays and None in results, never 0 or 1.
+``docs/reference/metrics.md`` describes each metric with its edge cases.
 """
 
 from __future__ import annotations
@@ -24,9 +24,11 @@ SUMS = (
     "duplicate",
     "near_miss",
 )
-"""What is counted an image; every count and every ratio is made of sums of these."""
+"""Names of the nine counts per image. All other counts and all ratios are computed from their sums over images."""
 
 PAPER_METRICS = ("detection_score", "id_matching_score", "average_false_alarm")
+"""Names of the paper's three metrics."""
+
 RATIOS = (
     *PAPER_METRICS,
     *(f"{name}_literal" for name in PAPER_METRICS),
@@ -34,7 +36,7 @@ RATIOS = (
     "recall",
     "f1",
 )
-"""The metrics that are ratios of sums over images, and so have intervals."""
+"""Names of the metrics that are ratios of sums. Only these have intervals."""
 
 METRICS = (
     *RATIOS,
@@ -46,7 +48,7 @@ METRICS = (
     "error_p95_radii",
     "error_rms_radii",
 )
-"""Names of all metrics, as they stand in the scores file and in gates."""
+"""Names of all metrics, as in the scores file."""
 
 COUNTS = (
     "images",
@@ -63,8 +65,7 @@ COUNTS = (
     "matched_literal",
     "id_correct_literal",
 )
-"""Names of all counts. Truths are matched or missed; detections are matched, duplicate, near_miss or clutter."""
-
+"""Names of all counts. A truth is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
 
 LABELS = {
     "detection_score": "detection score",
@@ -84,58 +85,109 @@ LABELS = {
     "error_p95_radii": "error, 95th percentile (radii)",
     "error_rms_radii": "error, RMS (radii)",
 }
-"""What people read for the names of metrics."""
+"""The label of each metric in tables and charts."""
 
 
-def ratios(sums: NDArray[Any], matching: str) -> dict[str, Float]:
-    """The metrics of :data:`RATIOS` from sums of shape (..., 9), each of shape (...); nan where undefined.
+def compute_ratios(sums: NDArray[Any], matching: str) -> dict[str, Float]:
+    """Compute the metrics that are ratios of sums.
 
-    ``matching`` is that of :class:`kpbench.scoring.Settings`.
+    Parameters
+    ----------
+    sums : ndarray of shape (..., 9)
+        Sums over images, in the order of :data:`kpbench.scoring.SUMS`.
+    matching : {"one-to-one", "literal"}
+        As in :class:`kpbench.scoring.Settings`.
+
+    Returns
+    -------
+    dict of str to ndarray of shape (...)
+        The metrics by name; nan where undefined.
+
+    Examples
+    --------
+    >>> import numpy as np, kpbench
+    >>> sums = np.array([1, 4, 5, 3, 3, 3, 3, 1, 0])  # 1 image, 4 truths, 5 detections, 3 matched, ...
+    >>> float(kpbench.scoring.compute_ratios(sums, "one-to-one")["detection_score"])
+    0.75
     """
     images, truths, detections, matched, id_correct, literal, id_literal = np.moveaxis(sums, -1, 0)[:7].astype(float)
 
-    def per(part: Float, whole: Float) -> Float:
+    def divide(part: Float, whole: Float) -> Float:
         return np.asarray(np.divide(part, whole, out=np.full(np.shape(part), np.nan), where=whole > 0))
 
     values = {
-        "detection_score": per(matched, truths),
-        "id_matching_score": per(id_correct, matched),
-        "average_false_alarm": per(detections - matched, images),
-        "detection_score_literal": per(literal, truths),
-        "id_matching_score_literal": per(id_literal, literal),
-        "average_false_alarm_literal": per(detections - literal, images),
-        "precision": per(matched, detections),
-        "recall": per(matched, truths),
-        "f1": per(2 * matched, truths + detections),
+        "detection_score": divide(matched, truths),
+        "id_matching_score": divide(id_correct, matched),
+        "average_false_alarm": divide(detections - matched, images),
+        "detection_score_literal": divide(literal, truths),
+        "id_matching_score_literal": divide(id_literal, literal),
+        "average_false_alarm_literal": divide(detections - literal, images),
+        "precision": divide(matched, detections),
+        "recall": divide(matched, truths),
+        "f1": divide(2 * matched, truths + detections),
     }
     if matching == "literal":
         values |= {name: values[f"{name}_literal"] for name in PAPER_METRICS}
     return values
 
 
-def precision_recall(score: Float, hit: NDArray[np.bool_], truths: int) -> tuple[float | None, Float, Float, Float]:
-    """Average precision, and (thresholds, matches, detections) above each, from the surest detection on.
+def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float, Float, Float]:
+    """Count matches and detections of at least each score.
 
-    ``score`` and ``hit`` (whether it is a match) are of shape (D,), in any order.
+    The matching prefers high scores. So removing all detections below a threshold keeps the number of matches above
+    it, and one matching serves all thresholds. A threshold cannot separate equal scores.
 
-    A threshold cannot split equal scores, so their order among each other does not matter.
-    The assignment prefers high scores, so cutting detections off below a threshold leaves the number of matches above
-    it as it is: one matching serves all thresholds.
+    Parameters
+    ----------
+    score : ndarray of shape (D,), float64
+        Scores of the detections, in any order.
+    hit : ndarray of shape (D,), bool
+        Whether each detection is a match.
+
+    Returns
+    -------
+    threshold : ndarray of shape (K,), float64
+        The different scores, falling.
+    matches, detections : ndarray of shape (K,), float64
+        Their numbers at each threshold.
     """
     every, hits = np.sort(score), np.sort(score[hit])  # sorting values is several times faster than sorting indices
     first = np.flatnonzero(np.append(True, np.diff(every) != 0)[: len(every)])[::-1]
-    level = every[first]
-    kept = (len(every) - first).astype(np.float64)
-    matched = (len(hits) - np.searchsorted(hits, level[::-1], side="left")[::-1]).astype(np.float64)
-    area = float(np.sum(np.diff(matched, prepend=0.0) / truths * matched / kept)) if truths else None
-    return area, level, matched, kept
+    threshold = every[first]
+    detections = (len(every) - first).astype(np.float64)
+    matches = (len(hits) - np.searchsorted(hits, threshold[::-1], side="left")[::-1]).astype(np.float64)
+    return threshold, matches, detections
 
 
-def error_metrics(distance: Float, radius: Float) -> dict[str, float | None]:
-    """Median, 95th percentile and RMS of the distances (px) of matched keypoints, in px and in their radii (px)."""
+def compute_average_precision(score: Float, hit: NDArray[np.bool_], truths: int) -> float | None:
+    """Compute the area under the precision-recall curve, without interpolation.
+
+    The area is the sum of (recallₖ − recallₖ₋₁) · precisionₖ over all thresholds k, from the highest on.
+
+    Parameters
+    ----------
+    score, hit : ndarray of shape (D,)
+        As for :func:`count_above_thresholds`.
+    truths : int
+        Number of true keypoints. Without any the result is None.
+    """
+    _, matches, detections = count_above_thresholds(score, hit)
+    return float(np.sum(np.diff(matches, prepend=0.0) / truths * matches / detections)) if truths else None
+
+
+def compute_error_metrics(distance: Float, radius: Float) -> dict[str, float | None]:
+    """Compute the median, the 95th percentile and the RMS of errors, in px and in radii.
+
+    Parameters
+    ----------
+    distance : ndarray of shape (M,), float64
+        Distance of each matched keypoint to its detection, px.
+    radius : ndarray of shape (M,), float64
+        Radius of each matched keypoint, px.
+    """
     metrics: dict[str, float | None] = {}
     for unit, error in (("px", distance), ("radii", distance / radius)):
-        error = np.sort(error)  # so that the order of images does not change the last bit
+        error = np.sort(error)  # the order of images must not change the last bit of the RMS
         some = len(error) > 0
         median, p95 = np.percentile(error, [50, 95]).tolist() if some else (None, None)
         metrics[f"error_median_{unit}"], metrics[f"error_p95_{unit}"] = median, p95

@@ -1,4 +1,4 @@
-"""Truth and detections, checked and matched: the rows that all metrics, comparisons and reports are made of."""
+"""Check predictions against the truth and match them: the rows that all metrics and reports are made from."""
 
 from __future__ import annotations
 
@@ -11,31 +11,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
-from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, Matches, match
-from kpbench.types import Float, Int, Predictions, Truth
+from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
+from kpbench.types import Int, Predictions, Truth
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How to score.
+    """The settings of a score.
 
     Attributes
     ----------
     eps : float
         Largest distance of a match, in radii of the true keypoint's projected circle.
     eps_radius : {"major", "minor", "mean"}
-        Which semi-axis of the projected circle is the radius; "mean" is half their sum.
+        The radius: the major or the minor semi-axis of the projected circle, or half their sum.
     matching : {"one-to-one", "literal"}
-        "literal" makes the paper's formulas as printed the main ones: every detection within ε counts,
-        so that a detection score can exceed 1.
+        "literal" takes the paper's formulas as they are printed. Every detection within ``eps`` then counts, so a
+        detection score can exceed 1.
     resamples : int
-        Bootstrap resamples behind the intervals.
+        Number of bootstrap resamples for the intervals. 0 computes no intervals.
     seed : int
-        Of the bootstrap.
+        Seed of the bootstrap.
 
     Raises
     ------
     ValueError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.scoring.Settings(eps=0.2).matching
+    'one-to-one'
     """
 
     eps: float = 0.1
@@ -46,169 +53,177 @@ class Settings:
 
     def __post_init__(self) -> None:
         if not 0 <= self.eps < np.inf:
-            raise ValueError(f"eps is {self.eps}, expected a finite number of 0 or more")
+            raise ValueError(f"`eps` is {self.eps}, expected a finite number of 0 or more")
         if self.eps_radius not in ("major", "minor", "mean"):
-            raise ValueError(f"eps_radius is {self.eps_radius!r}, expected major, minor or mean")
+            raise ValueError(f"`eps_radius` is {self.eps_radius!r}, expected major, minor or mean")
         if self.matching not in ("one-to-one", "literal"):
-            raise ValueError(f"matching is {self.matching!r}, expected one-to-one or literal")
+            raise ValueError(f"`matching` is {self.matching!r}, expected one-to-one or literal")
         if self.resamples < 0:
-            raise ValueError(f"resamples is {self.resamples}, expected 0 or more")
+            raise ValueError(f"`resamples` is {self.resamples}, expected 0 or more")
 
 
 @dataclass(frozen=True)
-class Tally:
-    """What became of T true keypoints and D detections in N images.
+class Outcomes:
+    """The outcome of each of T true keypoints and D detections in N images.
 
-    Rows keep the order of the truth and of the predictions, so that what belongs to an image lies together: with
-    millions of images every other order costs a cache miss a row.
+    Rows keep the order of the truth and of the predictions. The rows of an image then lie together in memory; with
+    millions of images any other order is slow.
 
     Attributes
     ----------
     truth : Truth
-    truth_image : ndarray of shape (T,), int64
-        Position of the image.
+    truth_points : TruthPoints
+        Place, radius and image of each true keypoint. The image is a position in ``truth``.
     truth_id : ndarray of shape (T,), int64
-    radius : ndarray of shape (T,), float64, px
-        The one that ε is a fraction of.
-    detection : ndarray of shape (T,), int64
-        Row of the detection that explains a true keypoint, or -1.
-    distance : ndarray of shape (T,), float64, px
-        To that detection; nan where there is none.
+        True identity.
+    detections : DetectionPoints
+        Place, score, image and identity of each detection. The image is a position in ``truth``.
+    matches : Matches
     correct : ndarray of shape (T,), bool
-        Matched, and with the right identity.
-    image : ndarray of shape (D,), int64
-        Position of the image.
-    xy : ndarray of shape (D, 2), float64, px
-    score : ndarray of shape (D,), float64
-    patch_id : ndarray of shape (D,), int64, or None
-    kind : ndarray of shape (D,), uint8
-        See :class:`kpbench.scoring.Matches`.
-    nearest : ndarray of shape (D,), int64
-        The nearest true keypoint in reach, or -1.
+        Whether the true keypoint is matched by a detection of the right identity.
     literally_correct : ndarray of shape (D,), bool
-        It has the identity of that one.
-    contradicted : ndarray of shape (T,), bool
-        See :class:`kpbench.scoring.Matches`.
+        Whether the detection has the identity of the nearest true keypoint within the largest distance of a match.
     settings : Settings
     detector : dict
+        The detector as the predictions describe it.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> outcomes = kpbench.scoring.match_predictions(
+    ...     kpbench.open_dataset("kpbench-data").truth, kpbench.read_predictions("preds.json")
+    ... )
+    >>> int(outcomes.matched.sum()), int(outcomes.correct.sum()), len(outcomes.truth_id)
+    (22, 22, 23)
     """
 
     truth: Truth
-    truth_image: Int
+    truth_points: TruthPoints
     truth_id: Int
-    radius: Float
-    detection: Int
-    distance: Float
+    detections: DetectionPoints
+    matches: Matches
     correct: NDArray[np.bool_]
-    image: Int
-    xy: Float
-    score: Float
-    patch_id: Int | None
-    kind: NDArray[np.uint8]
-    nearest: Int
     literally_correct: NDArray[np.bool_]
-    contradicted: NDArray[np.bool_]
     settings: Settings
     detector: dict[str, Any]
 
     @property
     def matched(self) -> NDArray[np.bool_]:
-        """(T,) whether a true keypoint is explained."""
-        return self.detection >= 0
+        """Whether each true keypoint is matched, of shape (T,)."""
+        return self.matches.detection >= 0
 
     @cached_property
     def image_sums(self) -> Int:
-        """(N, 9) counts of each image in the order of :data:`kpbench.scoring.SUMS`."""
-        return self.sums(self.truth_image, self.image, len(self.truth))
+        """The counts of each image, of shape (N, 9), in the order of :data:`kpbench.scoring.SUMS`."""
+        return self.sum_rows(self.truth_points.image, self.detections.image, len(self.truth))
 
-    def sums(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
-        """(rows, 9) counts in the order of :data:`kpbench.scoring.SUMS`; what is in row -1 is left out."""
+    def sum_rows(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
+        """Count true keypoints and detections by rows of your own.
+
+        Parameters
+        ----------
+        row_of_truth : ndarray of shape (T,), int64
+            The row that each true keypoint belongs to.
+        row_of_detection : ndarray of shape (D,), int64
+            The row that each detection belongs to. Detections of row -1 are left out.
+        rows : int
+            Number of rows.
+
+        Returns
+        -------
+        ndarray of shape (rows, 9), int64
+            In the order of :data:`kpbench.scoring.SUMS`.
+        """
 
         def count(row: Int) -> Int:
             return np.bincount(row[row >= 0], minlength=rows)
 
-        reaching = self.nearest >= 0
+        nearest, kind = self.matches.nearest, self.matches.kind
         columns = [
             np.ones(rows, np.int64),
             count(row_of_truth),
             count(row_of_detection),
             count(row_of_truth[self.matched]),
             count(row_of_truth[self.correct]),
-            count(row_of_truth[self.nearest[reaching]]),
-            count(row_of_truth[self.nearest[self.literally_correct]]),
-            count(row_of_detection[self.kind == DUPLICATE]),
-            count(row_of_detection[self.kind == NEAR_MISS]),
+            count(row_of_truth[nearest[nearest >= 0]]),
+            count(row_of_truth[nearest[self.literally_correct]]),
+            count(row_of_detection[kind == DUPLICATE]),
+            count(row_of_detection[kind == NEAR_MISS]),
         ]
         return np.stack(columns, axis=1)
 
 
-def tally(
+def match_predictions(
     truth: Truth, predictions: Predictions, settings: Settings | None = None, *, allow_missing: bool = False
-) -> Tally:
-    """Check that the predictions are for the images of the truth, and match them.
+) -> Outcomes:
+    """Check that the predictions are of the images of the truth, and match them.
+
+    Parameters
+    ----------
+    truth : Truth
+    predictions : Predictions
+    settings : Settings, optional
+    allow_missing : bool
+        Whether an image without prediction counts as an image without detections, instead of being refused.
+
+    Returns
+    -------
+    Outcomes
 
     Raises
     ------
     PredictionsError
-        If they are for other images, or for another dataset by its fingerprint.
+        If the predictions are of other images, or of another dataset by its fingerprint.
     DataError
-        If there are no images, or radii or places that are no positive finite numbers.
+        If there are no images, or if a place is not finite or a radius is not a positive number.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> truth = kpbench.open_dataset("kpbench-data").truth
+    >>> outcomes = kpbench.scoring.match_predictions(truth, kpbench.read_predictions("preds.json"))
+    >>> len(outcomes.matched) == len(truth.keypoints)
+    True
     """
     settings = settings or Settings()
     if not len(truth):
         raise DataError("the dataset has no images")
-    image = _image_of_detections(truth, predictions, allow_missing)
-    truth_xy, truth_image, radius = _places(truth, settings.eps_radius)
+    image = _find_images(truth, predictions, allow_missing)
+    points = _read_points(truth, settings.eps_radius)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
-    xy, score = predictions.xy, predictions.score
-    # Where nothing was detected it does not matter whether the detector would have told identities
-    ids = predictions.patch_id if len(xy) else np.zeros(0, np.int64)
-    found: Matches = match(truth_xy, truth_image, radius, settings.eps, xy, score, image, ids)
-    correct, literally = np.zeros(len(truth_xy), bool), np.zeros(len(image), bool)
+    # A detector that found nothing contradicts no identity, even if its file holds no IDs
+    ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
+    detections = DetectionPoints(predictions.xy, predictions.score, image, ids)
+    matches = match(points, detections, settings.eps)
+    correct, literally_correct = np.zeros(len(truth_id), bool), np.zeros(len(image), bool)
     if ids is not None:
-        t, d = np.flatnonzero(found.detection >= 0), np.flatnonzero(found.nearest >= 0)
-        correct[t] = (ids[found.detection[t]] == truth_id[t]) & ~found.contradicted[t]
-        literally[d] = ids[d] == truth_id[found.nearest[d]]
-    return Tally(
-        truth=truth,
-        truth_image=truth_image,
-        truth_id=truth_id,
-        radius=radius,
-        detection=found.detection,
-        distance=found.distance,
-        correct=correct,
-        image=image,
-        xy=xy,
-        score=score,
-        patch_id=ids,
-        kind=found.kind,
-        nearest=found.nearest,
-        literally_correct=literally,
-        contradicted=found.contradicted,
-        settings=settings,
-        detector=predictions.detector,
+        t, d = np.flatnonzero(matches.detection >= 0), np.flatnonzero(matches.nearest >= 0)
+        correct[t] = (ids[matches.detection[t]] == truth_id[t]) & ~matches.contradicted[t]
+        literally_correct[d] = ids[d] == truth_id[matches.nearest[d]]
+    return Outcomes(
+        truth, points, truth_id, detections, matches, correct, literally_correct, settings, predictions.detector
     )
 
 
-def _places(truth: Truth, eps_radius: str) -> tuple[Float, Int, Float]:
-    """Places (T, 2), images (T,) and radii (T,) of the true keypoints, after checking them."""
+def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
+    """Return the true keypoints as columns, after checking them."""
     keypoints = truth.keypoints
     xy = np.stack([keypoints["x"], keypoints["y"]], axis=1).astype(np.float64)
     major, minor = keypoints["radius_major"].astype(np.float64), keypoints["radius_minor"].astype(np.float64)
     radius = {"major": major, "minor": minor, "mean": (major + minor) / 2}[eps_radius]
     image = np.repeat(np.arange(len(truth)), np.diff(truth.offsets))
-    fine = np.isfinite(xy).all(axis=1) & np.isfinite(radius) & (radius > 0)
-    if not fine.all():
-        row = int(np.argmin(fine))
+    valid = np.isfinite(xy).all(axis=1) & np.isfinite(radius) & (radius > 0)
+    if not valid.all():
+        row = int(np.argmin(valid))
         raise DataError(
             f"image_id {truth.image_id[image[row]]}: a true keypoint at {xy[row].tolist()} has radius "
             f"{radius[row]}, expected finite numbers and a radius over 0"
         )
-    return xy, image, radius
+    return TruthPoints(xy, radius, image)
 
 
-def _image_of_detections(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
-    """Position in the truth of each detection's image, after checking that both are of the same images."""
+def _find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
+    """Return the position in the truth of each detection's image, after checking that the images are the same."""
     named = predictions.fingerprint or predictions.dataset or ""
     if re.fullmatch("[0-9a-f]{64}", named) and truth.fingerprint and named != truth.fingerprint:
         raise PredictionsError(
@@ -220,17 +235,16 @@ def _image_of_detections(truth: Truth, predictions: Predictions, allow_missing: 
         raise DataError(f"the dataset has image_id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
     place = np.searchsorted(ids, predictions.image_id)
     unknown = np.append(ids, -1)[place] != predictions.image_id
-    span = f"{len(ids)} images, image_id {ids[0]} to {ids[-1]}"
     if unknown.any():
         raise PredictionsError(
-            f"image_id {predictions.image_id[unknown].min()} is not in the dataset ({span}); "
-            f"{np.count_nonzero(unknown)} predictions are for images that it does not have"
+            f"image_id {predictions.image_id[unknown].min()} is not in the dataset ({len(ids)} images, image_id "
+            f"{ids[0]} to {ids[-1]}); {np.count_nonzero(unknown)} predictions are of images that it does not have"
         )
     missing = np.ones(len(ids), bool)
     missing[place] = False
     if missing.any() and not allow_missing:
         raise PredictionsError(
             f"no prediction for image_id {ids[missing][0]}; {np.count_nonzero(missing)} of {len(ids)} images are "
-            f"missing (`allow_missing=True` takes them as images without detections)"
+            "missing (`allow_missing=True` takes them as images without detections)"
         )
     return np.repeat(order[place], np.diff(predictions.offsets))

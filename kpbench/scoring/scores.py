@@ -1,15 +1,15 @@
-"""The evaluator: true keypoints and detections in, the paper's three metrics and more out. No files here.
+"""Score detections against true keypoints: the paper's three metrics and more. Nothing here reads a file.
 
 Conventions
 -----------
-A detection reaches a true keypoint if their distance is **at most** ε, a fraction of the radius of *that*
-keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection explains one keypoint only: of all
-one-to-one assignments the one with most matches is taken, among those the one with the highest scores, then the one
-with the smallest distances, then the one lower in (x, y). Identities never decide who is matched, and the
-order of images, keypoints and detections changes nothing.
+A detection is within reach of a true keypoint if their distance is **at most** ε. ε is a fraction of the radius of
+*that* keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection is matched to one keypoint. Of all
+one-to-one assignments kpbench takes the best: the most matches, then the highest scores, then the smallest distances,
+then the lowest place in (x, y). Identities never decide, and the order of images, keypoints and detections changes
+nothing.
 
-The chain is assignment (who explains whom) → tally (rows) → metrics and bootstrap (numbers from sums) → this module
-(groups of images). ``docs/reference/metrics.md`` describes each metric with its edge cases.
+The steps are: assignment (matches), outcomes (rows), metrics and bootstrap (numbers from sums), groups (of images and
+keypoints), and this module. ``docs/reference/metrics.md`` describes each metric with its edge cases.
 """
 
 from __future__ import annotations
@@ -22,74 +22,85 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from kpbench.errors import GateFailed, PredictionsError
-from kpbench.scoring.assignment import MATCHED, matched_within
-from kpbench.scoring.groups import Group, Key, make_groups
-from kpbench.scoring.metrics import precision_recall
-from kpbench.scoring.outcomes import Settings, Tally, tally
+from kpbench.scoring.assignment import MATCHED, count_matches
+from kpbench.scoring.groups import Group, GroupKey, make_groups
+from kpbench.scoring.metrics import count_above_thresholds
+from kpbench.scoring.outcomes import Outcomes, Settings, match_predictions
 from kpbench.types import Detections, Predictions, Truth
 
 SCHEMA = "kpbench.scores/1"
+"""Name and version of the format of scores files."""
 EPS_GRID = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
-ENDS = ("low", "high")
+"""The values of ε, in radii, at which a detector is scored for :attr:`Scores.eps_curve`."""
+CURVE_POINTS = 201
+"""Number of points that a precision-recall curve is thinned to."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """What :func:`score` returns.
+    """The result of :func:`kpbench.score`.
 
     Attributes
     ----------
     overall : Group
+        The metrics over all images.
     by : tuple of Group
-        A group for each condition and rung; where the truth has several patches, also for each of them within
-        the condition and rung, and for each over all images; and for each bin of radii over all images.
+        The metrics of each condition and rung. If the truth has several patches, also of each patch within each
+        condition and rung, and over all images. If radii fall into several bins, also of each bin over all images.
     confusion : dict
-        ``ids`` (true ones, sorted) and ``matrix``: a row a true id, a column a detected id of a matched
-        detection, and a last column for ids that no true keypoint has or that are contradicted. Empty
-        without identities.
+        The identities of matched detections. ``ids`` are the true ones, sorted; ``matrix`` has a row per true ID and
+        a column per detected ID. Its last column counts IDs that no true keypoint has, and contradicted IDs. Empty for
+        a detector without identities.
     curve : dict
-        ``score``, ``precision``, ``recall`` and ``average_false_alarm`` when only detections of at least that
-        score are kept, from the surest on; at most 201 points.
-    tally : Tally
-        The rows behind the numbers, of every true keypoint and detection.
+        ``score``, ``precision``, ``recall`` and ``average_false_alarm`` of the detections of at least that score,
+        from the highest score on; at most 201 points.
+    outcomes : Outcomes
+        The rows behind the numbers: every true keypoint and every detection.
     name : str
-        What tables and charts call the detector: its name and version.
+        Name and version of the detector, for tables and charts.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> round(scores["detection_score"], 3), scores["average_false_alarm"], scores.name
+    (0.957, 0.0, 'oracle')
     """
 
     overall: Group
     by: tuple[Group, ...]
     confusion: dict[str, Any]
     curve: dict[str, list[float | None]]
-    tally: Tally = field(repr=False)
+    outcomes: Outcomes = field(repr=False)
     name: str = "detector"
 
     def __getitem__(self, name: str) -> float | None:
-        """A metric over all images."""
+        """Return a metric over all images."""
         return self.overall.metrics[name]
 
     @property
     def settings(self) -> Settings:
-        """How it was scored."""
-        return self.tally.settings
+        """The settings of the score."""
+        return self.outcomes.settings
 
     @property
     def detector(self) -> dict[str, Any]:
-        """What the predictions file says about the detector."""
-        return self.tally.detector
+        """The detector as the predictions describe it."""
+        return self.outcomes.detector
 
     @property
     def fingerprint(self) -> str:
-        """Of the dataset, "" if unknown."""
-        return self.tally.truth.fingerprint
+        """Fingerprint of the dataset, "" if unknown."""
+        return self.outcomes.truth.fingerprint
 
     def group(self, condition: str | None, rung: float | None, patch_id: int | None = None) -> Group | None:
-        """The group of a condition, rung and patch, or None if there is none."""
-        return next((g for g in self.by if g.key == Key(condition, rung, patch_id)), None)
+        """Return the group of a condition, rung and patch, or None if the scores have no such group."""
+        return next((g for g in self.by if g.key == GroupKey(condition, rung, patch_id)), None)
 
     @property
     def conditions(self) -> dict[str, list[float]]:
-        """Rungs of every condition that has any, rising, conditions in the order of the first image."""
-        names = dict.fromkeys(self.tally.truth.condition.tolist())
+        """Rising rungs of each condition that has rungs; conditions in the order of their first image."""
+        names = dict.fromkeys(self.outcomes.truth.condition.tolist())
         rungs: dict[str, list[float]] = {name: [] for name in names if name}
         for g in self.by:
             if g.condition is not None and g.rung is not None and g.patch_id is None:
@@ -98,30 +109,33 @@ class Scores:
 
     @cached_property
     def eps_curve(self) -> dict[str, list[float | None]]:
-        """``detection_score`` and ``average_false_alarm`` of one-to-one matching when ``eps`` is another."""
-        rows = self.tally
-        keypoints, truths = rows.truth.keypoints, len(rows.truth_id)
-        xy = np.stack([keypoints["x"], keypoints["y"]], axis=1).astype(np.float64)
-        counts = matched_within(xy, rows.truth_image, rows.radius, EPS_GRID, rows.xy, rows.score, rows.image)
+        """``detection_score`` and ``average_false_alarm`` of one-to-one matching at other values of ``eps``."""
+        outcomes = self.outcomes
+        truths, detections, images = len(outcomes.truth_id), len(outcomes.detections.xy), len(outcomes.truth)
+        counts = count_matches(outcomes.truth_points, outcomes.detections, EPS_GRID)
         return {
             "eps": list(EPS_GRID),
             "detection_score": [n / truths if truths else None for n in counts],
-            "average_false_alarm": [(len(rows.xy) - n) / len(rows.truth) for n in counts],
+            "average_false_alarm": [(detections - n) / images for n in counts],
         }
 
     def rows(self) -> list[dict[str, Any]]:
-        """A flat table: one row a group, the first overall; bounds end in ``_low`` and ``_high``."""
+        """Return a flat table with a row per group, the first overall. Bounds of intervals end in _low and _high."""
         return [
             {"condition": g.condition, "rung": g.rung, "patch_id": g.patch_id}
             | dict(zip(("radius_px_low", "radius_px_high"), g.key.radius_px or (None, None), strict=True))
             | g.metrics
             | g.counts
-            | {f"{name}_{end}": both and both[k] for name, both in g.intervals.items() for k, end in enumerate(ENDS)}
+            | {
+                f"{name}_{end}": interval and interval[k]
+                for name, interval in g.intervals.items()
+                for k, end in enumerate(("low", "high"))
+            }
             for g in (self.overall, *self.by)
         ]
 
     def to_dict(self) -> dict[str, Any]:
-        """The scores file (``kpbench.scores/1``), without provenance."""
+        """Return the content of the scores file (``kpbench.scores/1``), without provenance."""
         return {
             "schema": SCHEMA,
             "dataset": {"fingerprint": self.fingerprint or None, "images": self.overall.counts["images"]},
@@ -135,45 +149,42 @@ class Scores:
         }
 
 
-# --- groups -----------------------------------------------------------------------------------------------------
-
-
-def _confusion(rows: Tally) -> dict[str, Any]:
-    if rows.patch_id is None:
+def _count_confusions(outcomes: Outcomes) -> dict[str, Any]:
+    """Return :attr:`Scores.confusion`."""
+    patch_id, matches, matched = outcomes.detections.patch_id, outcomes.matches, outcomes.matched
+    if patch_id is None:
         return {}
-    matched = rows.matched
-    ids, row = np.unique(rows.truth_id, return_inverse=True)
-    detected = rows.patch_id[rows.detection[matched]]
+    ids, row = np.unique(outcomes.truth_id, return_inverse=True)
+    detected = patch_id[matches.detection[matched]]
     column = np.searchsorted(ids, detected)
     known = np.append(ids, -1)[column] == detected
-    known &= ~rows.contradicted[matched]
+    known &= ~matches.contradicted[matched]
     cell = row[matched] * (len(ids) + 1) + np.where(known, column, len(ids))
     matrix = np.bincount(cell, minlength=len(ids) * (len(ids) + 1)).reshape(len(ids), len(ids) + 1)
     return {"ids": ids.tolist(), "matrix": matrix.tolist()}
 
 
-def _curve(rows: Tally) -> dict[str, list[float | None]]:
-    truths = len(rows.truth_id)
-    _, level, hits, kept = precision_recall(rows.score, rows.kind == MATCHED, truths)
-    some = np.unique(np.linspace(0, len(level) - 1, 201).astype(int)) if len(level) else np.zeros(0, int)
-    level, hits, kept = level[some], hits[some], kept[some]
+def _trace_curve(outcomes: Outcomes) -> dict[str, list[float | None]]:
+    """Return :attr:`Scores.curve`."""
+    truths = len(outcomes.truth_id)
+    threshold, matches, detections = count_above_thresholds(outcomes.detections.score, outcomes.matches.kind == MATCHED)
+    points = CURVE_POINTS if len(threshold) else 0
+    rows = np.unique(np.linspace(0, len(threshold) - 1, points).astype(int))
+    threshold, matches, detections = threshold[rows], matches[rows], detections[rows]
     return {
-        "score": level.tolist(),
-        "precision": (hits / kept).tolist(),
-        "recall": (hits / truths).tolist() if truths else [None] * len(some),
-        "average_false_alarm": ((kept - hits) / len(rows.truth)).tolist(),
+        "score": threshold.tolist(),
+        "precision": (matches / detections).tolist(),
+        "recall": (matches / truths).tolist() if truths else [None] * len(rows),
+        "average_false_alarm": ((detections - matches) / len(outcomes.truth)).tolist(),
     }
 
 
-# --- the public calls -------------------------------------------------------------------------------------------
-
-
 class HasTruth(Protocol):
-    """What a dataset offers to the evaluator."""
+    """A dataset as :func:`kpbench.score` needs it."""
 
     @property
     def truth(self) -> Truth:
-        """The true keypoints."""
+        """The true keypoints of all images."""
         ...
 
 
@@ -193,26 +204,61 @@ def score(
     Parameters
     ----------
     truth : Truth or Dataset
-    detections : Predictions, or one Detections for each image of the truth, in its order
+    detections : Predictions or iterable of Detections
+        Predictions by image ID; or one :class:`kpbench.Detections` per image of the truth, in the truth's order.
     eps, eps_radius, matching, resamples, seed
-        See :class:`kpbench.scoring.Settings`.
+        As in :class:`kpbench.scoring.Settings`.
     allow_missing : bool
-        Take an image without prediction as one without detections, instead of refusing it.
+        Whether an image without prediction counts as an image without detections, instead of being refused.
+
+    Returns
+    -------
+    Scores
 
     Raises
     ------
     PredictionsError
-        If the predictions are for other images than the truth's, or for another dataset by its fingerprint.
+        If the predictions are of other images than the truth's, or of another dataset by its fingerprint.
     DataError
-        If the truth holds radii or places that are no positive finite numbers.
+        If a place of the truth is not finite or a radius is not a positive number.
     ValueError
         If a setting is out of its range.
+
+    Notes
+    -----
+    The paper's three metrics, written to be read. It tries every one-to-one assignment, so it is slow. A test holds
+    ``score`` equal to this code. The paper lets several detections of a keypoint count, so its detection score is at
+    least this one (`matching` "literal").
+
+    >>> from itertools import permutations
+    >>> from math import hypot
+    >>> def reference_metrics(images, eps):
+    ...     truths = detections = matched = correct = 0
+    ...     for keypoints, found in images:  # rows (x, y, radius, ID) and rows (x, y, score, ID)
+    ...         best = (0, [], 0.0), []
+    ...         none = [None] * len(keypoints)
+    ...         for chosen in permutations([*found, *none], len(keypoints)):
+    ...             pairs = [(k, d) for k, d in zip(keypoints, chosen) if d is not None]
+    ...             distances = [hypot(k[0] - d[0], k[1] - d[1]) for k, d in pairs]
+    ...             if all(distance <= eps * k[2] for distance, (k, _) in zip(distances, pairs)):
+    ...                 scores = sorted((d[2] for _, d in pairs), reverse=True)
+    ...                 best = max(best, ((len(pairs), scores, -sum(distances)), pairs), key=lambda b: b[0])
+    ...         truths, detections, matched = truths + len(keypoints), detections + len(found), matched + len(best[1])
+    ...         for k, d in best[1]:  # a second ID at the same place with the same score makes both wrong
+    ...             correct += {other[3] for other in found if other[:3] == d[:3]} == {k[3]}
+    ...     return {
+    ...         "detection_score": matched / truths if truths else None,
+    ...         "id_matching_score": correct / matched if matched else None,
+    ...         "average_false_alarm": (detections - matched) / len(images),
+    ...     }
 
     Examples
     --------
     >>> import kpbench
-    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
-    >>> scores["detection_score"], scores.overall.intervals["detection_score"]
+    >>> dataset, predictions = kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json")
+    >>> scores = kpbench.score(dataset, predictions)
+    >>> scores.overall.counts["matched"], scores.overall.counts["missed"], scores["id_matching_score"]
+    (22, 1, 1.0)
     """
     settings = Settings(eps, eps_radius, matching, resamples, seed)
     table = truth if isinstance(truth, Truth) else truth.truth
@@ -223,39 +269,52 @@ def score(
                 f"{len(listed)} images with detections, expected one for each of {len(table)} images"
             )
         detections = Predictions.from_detections(listed, table.image_id)
-    return evaluate(table, detections, settings, allow_missing=allow_missing)
+    return compute_scores(match_predictions(table, detections, settings, allow_missing=allow_missing))
 
 
-def evaluate(
-    truth: Truth, predictions: Predictions, settings: Settings | None = None, *, allow_missing: bool = False
-) -> Scores:
-    """As :func:`score`, on the tables themselves."""
-    return summarise(tally(truth, predictions, settings, allow_missing=allow_missing))
+def compute_scores(outcomes: Outcomes) -> Scores:
+    """Compute all metrics of all groups from matched predictions.
 
-
-def summarise(rows: Tally) -> Scores:
-    """All metrics of a tally."""
-    overall, *by = make_groups(rows)
-    told = (str(rows.detector.get(key) or "") for key in ("name", "version"))
-    name = " ".join(part for part in told if part not in ("", "unknown"))
-    return Scores(overall, tuple(by), _confusion(rows), _curve(rows), rows, name or "detector")
+    Examples
+    --------
+    >>> import kpbench
+    >>> truth = kpbench.open_dataset("kpbench-data").truth
+    >>> outcomes = kpbench.scoring.match_predictions(truth, kpbench.read_predictions("preds.json"))
+    >>> kpbench.scoring.compute_scores(outcomes)["precision"]
+    1.0
+    """
+    overall, *by = make_groups(outcomes)
+    about = (str(outcomes.detector.get(key) or "") for key in ("name", "version"))
+    name = " ".join(part for part in about if part not in ("", "unknown"))
+    return Scores(overall, tuple(by), _count_confusions(outcomes), _trace_curve(outcomes), outcomes, name or "detector")
 
 
 def check_gates(scores: Scores, least: dict[str, float], most: dict[str, float]) -> None:
-    """Hold the overall metrics against limits; an undefined metric meets none.
+    """Refuse scores beyond limits. An undefined metric meets no limit.
+
+    Parameters
+    ----------
+    scores : Scores
+    least, most : dict of str to float
+        Limits of metrics over all images, by name. A metric equal to its limit meets it.
 
     Raises
     ------
     GateFailed
-        Naming every metric that is below ``least`` or above ``most``.
+        If a metric is below ``least`` or above ``most``; the message names every such metric.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.scoring.check_gates(scores, least={"detection_score": 0.9}, most={"average_false_alarm": 0.5})
     """
     failed = []
     for limits, sign, relation in ((least, 1, "at least"), (most, -1, "at most")):
         for name, limit in limits.items():
             value = scores[name]
             if value is None or sign * value < sign * limit:
-                failed.append(
-                    f"{name} is {'undefined' if value is None else f'{value:.6g}'}, expected {relation} {limit:g}"
-                )
+                shown = "undefined" if value is None else f"{value:.6g}"
+                failed.append(f"{name} is {shown}, expected {relation} {limit:g}")
     if failed:
         raise GateFailed("; ".join(failed))

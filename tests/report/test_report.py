@@ -17,10 +17,10 @@ from kpbench.report import figures as exhibits
 from kpbench.report.charts import Series, bar_chart, line_chart
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
 from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report, write_report
-from kpbench.report.result_files import scores_csv, scores_file
+from kpbench.report.result_files import encode_scores, encode_scores_csv
 from kpbench.report.tables import Estimate, Table, to_latex, to_markdown, to_plain
-from kpbench.report.worst_cases import worst_cases
-from kpbench.scoring.breakpoints import breakpoints
+from kpbench.report.worst_cases import pick_worst_cases
+from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.scores import score
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
@@ -70,7 +70,9 @@ def report(scores):
     config = {"kind": "suite", "patches": [{"id": 0, "name": "checker"}, {"id": 1, "name": "<trefoil>"}]}
     other = score(*ladder(share={3: 1.0, 15: 0.5}, condition="fog & <rain>"), resamples=50)
     assert other.conditions == {"fog & <rain>": [3, 15]}
-    return Report((scores,), config, (worst_cases(scores.tally, image),), {"command": "kpbench <score>"}, title="A & B")
+    return Report(
+        (scores,), config, (pick_worst_cases(scores.outcomes, image),), {"command": "kpbench <score>"}, title="A & B"
+    )
 
 
 # --- tables -----------------------------------------------------------------------------------------------------
@@ -137,22 +139,22 @@ def test_the_papers_table_says_what_is_simulated(scores):
 
 
 def test_a_breakpoint_lies_on_the_line_between_two_rungs(scores):
-    (b,) = breakpoints(scores, 0.9)
+    (b,) = find_breakpoints(scores, 0.9)
     assert (b.condition, b.crossing) == ("blur", "falls")
     assert b.rung == pytest.approx(7 + 4 * 0.05 / 0.45)
     assert b.interval == pytest.approx((b.rung, b.rung))  # all scenes are alike
-    assert breakpoints(scores, 0.2)[0].crossing == "over"
+    assert find_breakpoints(scores, 0.2)[0].crossing == "over"
     rising = score(*ladder(share={1: 0.5, 2: 0.8, 4: 1.0}), resamples=10)
-    (b,) = breakpoints(rising, 0.9)
+    (b,) = find_breakpoints(rising, 0.9)
     assert (b.crossing, b.rung) == ("rises", pytest.approx(3))
-    assert breakpoints(rising, 1.01)[0].crossing == "under"
+    assert find_breakpoints(rising, 1.01)[0].crossing == "under"
     valley = score(*ladder(share={1: 1.0, 2: 0.5, 3: 1.0}), resamples=0)
-    assert [(b.crossing, b.rung, b.interval) for b in breakpoints(valley, 0.75)] == [
+    assert [(b.crossing, b.rung, b.interval) for b in find_breakpoints(valley, 0.75)] == [
         ("falls", 1.5, None),
         ("rises", 2.5, None),
     ]
     one_rung = [score(*ladder(share={1: share}), resamples=10) for share in (1.0, 0.5)]
-    assert [b.crossing for run in one_rung for b in breakpoints(run, 0.9)] == ["over", "under"]
+    assert [b.crossing for run in one_rung for b in find_breakpoints(run, 0.9)] == ["over", "under"]
 
 
 def test_a_breakpoints_interval_is_that_of_its_scenes():
@@ -161,7 +163,7 @@ def test_a_breakpoints_interval_is_that_of_its_scenes():
     keep = rng.random(40)
     some = [d[rng.random(len(d)) < 0.7 + 0.3 * keep[k % 40]] for k, d in enumerate(detections)]
     scores = score(truth, some, resamples=400)
-    (b,) = breakpoints(scores, 0.6)
+    (b,) = find_breakpoints(scores, 0.6)
     low, high = b.interval
     assert low < b.rung < high
     assert high - low < 2
@@ -280,9 +282,9 @@ def test_an_unknown_suffix_is_one_line(report, tmp_path):
 
 
 def test_the_scores_file_holds_breakpoints_and_csv_says_what_it_is_of(scores):
-    content = json.loads(scores_file(scores, {"kpbench": "1"}))
+    content = json.loads(encode_scores(scores, {"kpbench": "1"}))
     assert content["breakpoints"][0]["crossing"] == "falls"
-    rows = list(csv.DictReader(io.StringIO(scores_csv(scores, {"kpbench": "1"}).decode())))
+    rows = list(csv.DictReader(io.StringIO(encode_scores_csv(scores, {"kpbench": "1"}).decode())))
     assert {row["dataset"] for row in rows} == {"f" * 64}
     assert {(row["radius_px_low"], row["radius_px_high"]) for row in rows} == {
         ("", ""), ("0", "5"), ("5", "10"), ("10", "20"), ("20", "40"),
@@ -293,7 +295,7 @@ def test_the_scores_file_holds_breakpoints_and_csv_says_what_it_is_of(scores):
 
 
 def test_the_worst_images_come_first_and_a_good_one_never(scores):
-    cases = worst_cases(scores.tally, lambda k: np.zeros((300, 640), np.uint8), 20)
+    cases = pick_worst_cases(scores.outcomes, lambda k: np.zeros((300, 640), np.uint8), 20)
     assert {case.rung for case in cases} == {7, 11, 15}
     wrong = [sum(case.failures.values()) for case in cases]
     assert wrong == sorted(wrong, reverse=True)
@@ -303,14 +305,14 @@ def test_the_worst_images_come_first_and_a_good_one_never(scores):
     assert [m.kind for m in eleven.truth].count("wrong ID") == 1
     assert [m.kind for m in eleven.detections].count("matched") == 9
     flawless = score(*ladder(share={3: 1.0}), resamples=0)
-    assert worst_cases(flawless.tally, lambda k: np.zeros((300, 640), np.uint8)) == ()
+    assert pick_worst_cases(flawless.outcomes, lambda k: np.zeros((300, 640), np.uint8)) == ()
 
 
 def test_conditions_share_the_gallery():
     truth, detections = ladder()
     names = np.where(truth.rung < 10, "a", "b")
     mixed = score(Truth(**{**vars(truth), "condition": names}), detections, resamples=0)
-    cases = worst_cases(mixed.tally, lambda k: np.zeros((300, 640), np.uint8), 8)
+    cases = pick_worst_cases(mixed.outcomes, lambda k: np.zeros((300, 640), np.uint8), 8)
     assert [case.condition for case in cases].count("b") == 4
 
 
@@ -319,7 +321,7 @@ def test_a_small_board_is_shown_larger():
     keypoints = truth.keypoints.copy()
     keypoints["x"], keypoints["y"], keypoints["radius_major"] = keypoints["x"] / 10 + 500, 250, 3
     scores = score(Truth(**{**vars(truth), "keypoints": keypoints}), [Detections.none()], resamples=0)
-    (case,) = worst_cases(scores.tally, lambda k: np.zeros((300, 640), np.uint8))
+    (case,) = pick_worst_cases(scores.outcomes, lambda k: np.zeros((300, 640), np.uint8))
     left, top, width, height = case.box
     assert (width, height) == (160, 75)
     assert left <= 502 - 9

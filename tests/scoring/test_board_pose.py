@@ -9,8 +9,8 @@ import pytest
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.report.figures import pose_table
-from kpbench.report.result_files import scores_file
-from kpbench.scoring.board_pose import PoseErrors, pose_errors, pose_groups
+from kpbench.report.result_files import encode_scores
+from kpbench.scoring.board_pose import PoseErrors, compute_pose_errors, group_pose_errors
 from kpbench.scoring.scores import score
 from kpbench.synth.suite import SuiteConfig, board_in_view
 from kpbench.synth.suite_file import load_suite
@@ -45,7 +45,7 @@ def truth_of(poses):
 
 
 def errors(found):
-    return pose_errors(score(truth_of(TRUE), found, eps=1.0, resamples=0).tally, BOARD, CAMERA)
+    return compute_pose_errors(score(truth_of(TRUE), found, eps=1.0, resamples=0).outcomes, BOARD, CAMERA)
 
 
 def test_exact_detections_give_the_exact_pose():
@@ -66,15 +66,15 @@ def test_groups_are_percentiles_of_the_images_with_a_pose():
     found = [Detections(seen(*pose)[:n], np.ones(n)) for pose, n in zip(TRUE, (6, 6, 3), strict=True)]
     run = score(replace(truth_of(TRUE), condition=np.array(["a", "a", "b"]), rung=np.zeros(3)), found, resamples=0)
     errors = PoseErrors(np.array([1.0, 3.0, np.nan]), np.array([2.0, 4.0, np.nan]))
-    everything, a, b = pose_groups(run, errors)
+    everything, a, b = group_pose_errors(run, errors)
     assert astuple(everything) == (None, None, 3, 2, 2.0, pytest.approx(2.9), 3.0, pytest.approx(3.9))
     assert astuple(a) == ("a", 0, 2, 2, *astuple(everything)[4:])
     assert astuple(b) == ("b", 0, 1, 0, None, None, None, None)
     schema = json.loads((Path(__file__).parents[2] / "docs" / "schemas" / "scores-1.json").read_text())
-    content = json.loads(scores_file(run, {}, pose_groups(run, errors)))
+    content = json.loads(encode_scores(run, {}, group_pose_errors(run, errors)))
     jsonschema.Draft202012Validator(schema).validate(content)
     assert content["pose"] == [asdict(group) for group in (everything, a, b)]
-    assert "pose" not in json.loads(scores_file(run, {}))
+    assert "pose" not in json.loads(encode_scores(run, {}))
 
 
 def test_four_points_are_enough_and_three_are_none():
@@ -94,9 +94,9 @@ def test_false_alarms_and_identities_do_not_enter():
 
 def test_images_must_show_the_board():
     truth = truth_of(TRUE)
-    rows = score(truth, [Detections.none()] * 3, resamples=0).tally
+    rows = score(truth, [Detections.none()] * 3, resamples=0).outcomes
     with pytest.raises(DataError, match="image_id 0 has 6 keypoints, but the board has 5"):
-        pose_errors(rows, BOARD[:5], CAMERA)
+        compute_pose_errors(rows, BOARD[:5], CAMERA)
 
 
 @pytest.mark.parametrize("board", [None, "aruco"])
@@ -117,9 +117,9 @@ def test_a_suites_truth_is_its_board_seen_by_its_camera(board):
     places = [np.stack([shot.keypoints["x"], shot.keypoints["y"]], axis=1) for shot in shots]
     exact = [Detections(xy, np.ones(len(xy))) for xy in places]
     scores = score(truth, exact, resamples=0)
-    e = pose_errors(scores.tally, points, camera)
+    e = compute_pose_errors(scores.outcomes, points, camera)
     assert np.nanmax(e.translation_percent) < 1e-3
-    groups = pose_groups(scores, e)
+    groups = group_pose_errors(scores, e)
     rungs = sorted({s.rung for s in shots})
     assert [(g.condition, g.rung) for g in groups] == [(None, None), *(("pitch", r) for r in rungs)]
     assert (groups[0].images, groups[0].with_pose) == (n, n)

@@ -6,7 +6,7 @@ import pytest
 from kpbench.errors import DataError, GateFailed
 from kpbench.predictions.files import Predictions
 from kpbench.report.report import Report, to_html, to_markdown_report
-from kpbench.scoring.comparison import METRICS, check_regression, compare
+from kpbench.scoring.comparison import COMPARED_METRICS, check_regression, compare
 from kpbench.scoring.scores import score
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
@@ -50,7 +50,11 @@ def test_a_detector_against_itself_is_even_everywhere():
     c = compare(run(hits), run(hits))
     assert {d.value for d in c.differences} == {0.0}
     assert {d.verdict for d in c.differences} == {"even"}
-    assert [(d.condition, d.rung) for d in c.differences[:: len(METRICS)]] == [(None, None), ("blur", 3), ("blur", 15)]
+    assert [(d.condition, d.rung) for d in c.differences[:: len(COMPARED_METRICS)]] == [
+        (None, None),
+        ("blur", 3),
+        ("blur", 15),
+    ]
     check_regression([c])
 
 

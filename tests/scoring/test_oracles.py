@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from kpbench.predictions.files import Predictions
-from kpbench.scoring.assignment import match
-from kpbench.scoring.outcomes import Settings
-from kpbench.scoring.scores import evaluate
+from kpbench.scoring.assignment import DetectionPoints, TruthPoints, match
+from kpbench.scoring.scores import score
 from kpbench.types import KEYPOINT_DTYPE, Truth
 
 CASES = 1000
@@ -56,7 +55,7 @@ def test_a_thousand_cases_against_brute_force():
     truth_image = np.repeat(np.arange(CASES), [len(c) for c in columns[0]])
     image = np.repeat(np.arange(CASES), [len(c) for c in columns[2]])
     truth, radius, found, score = (np.concatenate(column) for column in columns)
-    m = match(truth, truth_image, radius, 1.0, found, score, image)
+    m = match(TruthPoints(truth, radius, truth_image), DetectionPoints(found, score, image), 1.0)
     assert np.count_nonzero(m.detection >= 0) > 400
     for k, (xy, reach, detections, levels) in enumerate(cases):
         rows = np.flatnonzero(truth_image == k)
@@ -102,7 +101,7 @@ def test_pycocotools_counts_the_same_where_patches_do_not_overlap():
     coco_module, eval_module = pytest.importorskip("pycocotools.coco"), pytest.importorskip("pycocotools.cocoeval")
     images = 200
     truth, found = spread(np.random.default_rng(7), images)
-    scores = evaluate(*tables(truth, found, images), Settings(resamples=0))
+    scores = score(*tables(truth, found, images), resamples=0)
     radius32 = truth[:, 3].astype(np.float32).astype(float)  # as the table of truth holds it
     coco = coco_module.COCO()
     coco.dataset = {
@@ -153,7 +152,8 @@ def test_mir_eval_matches_as_many_on_a_line_however_crowded():
     truth_image, image = (np.repeat(np.arange(CASES), n) for n in sizes)
     on_line = (np.column_stack([np.zeros(len(places)), places]) for places in (truth, found))
     truth_xy, xy = on_line
-    m = match(truth_xy, truth_image, np.full(len(truth), 5.0), 0.2, xy, rng.random(len(found)), image)
+    truth_points = TruthPoints(truth_xy, np.full(len(truth), 5.0), truth_image)
+    m = match(truth_points, DetectionPoints(xy, rng.random(len(found)), image), 0.2)
     ours = np.bincount(truth_image[m.detection >= 0], minlength=CASES)
     theirs = [len(match_events(truth[truth_image == k], found[image == k], 1.0)) for k in range(CASES)]
     assert ours.tolist() == theirs

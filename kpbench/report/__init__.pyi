@@ -1,0 +1,32 @@
+from .charts import CHART_COLOURS as CHART_COLOURS
+from .charts import CHART_STYLE as CHART_STYLE
+from .charts import Series as Series
+from .charts import bar_chart as bar_chart
+from .charts import line_chart as line_chart
+from .figures import Figure as Figure
+from .figures import breakpoint_table as breakpoint_table
+from .figures import difference_table as difference_table
+from .figures import group_table as group_table
+from .figures import overview_table as overview_table
+from .figures import paper_table as paper_table
+from .figures import pose_table as pose_table
+from .figures import severity_chart as severity_chart
+from .figures import verdict_table as verdict_table
+from .paper import PAPER as PAPER
+from .paper import PaperTable as PaperTable
+from .paper import paper_value as paper_value
+from .report import Report as Report
+from .report import write_report as write_report
+from .summary import summarise_comparisons as summarise_comparisons
+from .summary import summarise_scores as summarise_scores
+from .tables import Cell as Cell
+from .tables import Estimate as Estimate
+from .tables import Table as Table
+from .tables import to_latex as to_latex
+from .tables import to_markdown as to_markdown
+from .tables import to_plain as to_plain
+from .worst_cases import Case as Case
+from .worst_cases import Mark as Mark
+from .worst_cases import pick_worst_cases as pick_worst_cases
+
+__all__: list[str]

@@ -1,0 +1,30 @@
+from .assignment import DetectionPoints as DetectionPoints
+from .assignment import Matches as Matches
+from .assignment import TruthPoints as TruthPoints
+from .board_pose import PoseErrors as PoseErrors
+from .board_pose import PoseGroup as PoseGroup
+from .board_pose import compute_pose_errors as compute_pose_errors
+from .board_pose import group_pose_errors as group_pose_errors
+from .bootstrap import bootstrap_intervals as bootstrap_intervals
+from .breakpoints import Breakpoint as Breakpoint
+from .breakpoints import find_breakpoints as find_breakpoints
+from .comparison import Comparison as Comparison
+from .comparison import Difference as Difference
+from .comparison import check_regression as check_regression
+from .comparison import compare as compare
+from .groups import Group as Group
+from .groups import GroupKey as GroupKey
+from .metrics import COUNTS as COUNTS
+from .metrics import LABELS as LABELS
+from .metrics import METRICS as METRICS
+from .metrics import SUMS as SUMS
+from .metrics import compute_ratios as compute_ratios
+from .outcomes import Outcomes as Outcomes
+from .outcomes import Settings as Settings
+from .outcomes import match_predictions as match_predictions
+from .scores import Scores as Scores
+from .scores import check_gates as check_gates
+from .scores import compute_scores as compute_scores
+from .scores import score as score
+
+__all__: list[str]
