@@ -1,34 +1,46 @@
-"""Every error that kpbench raises on purpose.
+"""The errors that kpbench raises on purpose.
 
 ::
 
-    KpbenchError            one line for the user: file, place, what was expected
-    ├── DesignError         a patch, board or page that cannot be (TOML, geometry, paper size)
-    ├── DataError           a dataset, shard, image folder or weights file that cannot be used
-    ├── PredictionsError    a predictions file that cannot be read, or that fits no dataset
-    └── GateFailed          the scores are fine to read, but a ``--min`` gate was not met
+    KpbenchError            base class; the message is one line with file, place and expectation
+    ├── DesignError         a patch, a board or a page is impossible (TOML file, geometry, page size)
+    ├── DataError           a dataset, an image, a folder or a weights file cannot be used
+    ├── PredictionsError    a predictions file cannot be read, or does not fit its dataset
+    └── GateFailed          a score misses a limit that the caller set
 
-The command line prints the message and exits with 1; a library user catches ``KpbenchError``.
+A user of the library catches ``KpbenchError``. The command line prints the message and exits with 1.
 """
 
 from __future__ import annotations
 
 
 class KpbenchError(Exception):
-    """Base of all errors that kpbench raises on purpose."""
+    """Base class of all errors that kpbench raises on purpose.
+
+    The message is one line. It names the file, the place within the file and what was expected.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> try:
+    ...     kpbench.load_patches(["mine.toml"])
+    ... except kpbench.KpbenchError as error:
+    ...     print(error)
+    mine.toml: cannot be read, No such file or directory
+    """
 
 
 class DesignError(KpbenchError):
-    """A patch, board or page that cannot be."""
+    """A patch, a board or a page is impossible."""
 
 
 class DataError(KpbenchError):
-    """A dataset, shard, image folder or weights file that cannot be used."""
+    """A dataset, an image, a folder or a weights file cannot be used."""
 
 
 class PredictionsError(KpbenchError):
-    """A predictions file that cannot be read, or that fits no dataset."""
+    """A predictions file cannot be read, or does not fit its dataset."""
 
 
 class GateFailed(KpbenchError):
-    """A ``--min METRIC=VALUE`` gate was not met."""
+    """A score misses a limit that the caller set."""

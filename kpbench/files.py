@@ -1,4 +1,4 @@
-"""Files: read as TOML or text, found as images, written whole or not at all; and folders that are URLs."""
+"""Files and folders: find images, read text, write a file whole or not at all, use a URL as a folder."""
 
 from __future__ import annotations
 
@@ -17,37 +17,38 @@ from kpbench.errors import DataError, KpbenchError
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
 PACKAGE = Path(__file__).parent
-"""The folder of this package."""
+"""Folder of this package."""
 _IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": "configs"}
 
 
 def shipped_folder(name: str) -> Path:
-    """Find data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
+    """Return the folder of data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
 
-    In a checkout they lie where people edit them, in an installed package all in one folder.
+    A checkout holds the data where people edit them. An installed package holds all data in one folder.
     """
     installed = PACKAGE / "shipped" / name
     return installed if installed.is_dir() else PACKAGE.parent / _IN_CHECKOUT[name]
 
 
-def image_files(folder: Path, but: Path | None = None) -> tuple[str, ...]:
-    """Paths of all images below a folder, relative to it and sorted, so that they are the same on every machine.
+def image_files(folder: Path, exclude: Path | None = None) -> tuple[str, ...]:
+    """Return the paths of all images below a folder, relative to the folder.
 
-    What lies in the folder ``but``, where results are written, is left out.
+    The paths are sorted. Every machine therefore gives the same order. Images below the folder ``exclude`` are left
+    out: results are written to that folder.
     """
     files = [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file()]
-    if but is not None:
-        files = [f for f in files if but.resolve() not in f.resolve().parents]
+    if exclude is not None:
+        files = [f for f in files if exclude.resolve() not in f.resolve().parents]
     return tuple(sorted(f.relative_to(folder).as_posix() for f in files))
 
 
 def read_text(path: str | Path, error: type[KpbenchError]) -> str:
-    """The text of a UTF-8 file.
+    """Return the text of a UTF-8 file.
 
     Raises
     ------
     error
-        One line that names the file, if it cannot be read.
+        If the file cannot be read. The message names the file.
     """
     try:
         return Path(path).read_text("utf-8")
@@ -58,7 +59,7 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
 
 
 def sha256_of(path: Path) -> str:
-    """Compute the SHA-256 of a file, as 64 hexadecimal digits.
+    """Return the SHA-256 of a file as 64 hexadecimal digits.
 
     Raises
     ------
@@ -72,44 +73,46 @@ def sha256_of(path: Path) -> str:
         raise DataError(f"{path}: cannot be read, {error.strerror}") from None
 
 
-def folder_at(where: str | Path) -> Path:
-    """A folder of this machine, or one that fsspec reaches by a URL such as ``s3://bucket/name``, used like a path.
+def folder_at(place: str | Path) -> Path:
+    """Return the folder at a path, or at a URL such as ``s3://bucket/name``.
+
+    fsspec reads and writes folders at URLs. The result behaves like a path in both cases.
 
     Raises
     ------
     DataError
-        If it is a URL and what it takes to reach it is not installed.
+        If the package that reaches this kind of URL is not installed.
     """
-    if not is_local(where):
-        return where  # type: ignore[return-value]
-    url = re.match(r"([a-z][a-z0-9+.-]+):/+(.*)", str(where))  # pathlib makes one slash of two
+    if not is_local(place):
+        return place  # type: ignore[return-value]
+    url = re.match(r"([a-z][a-z0-9+.-]+):/+(.*)", str(place))  # Path turns "//" into "/"
     if url is None:
-        return Path(where)
+        return Path(place)
     if url[1] == "file":
         return Path("/", unquote(url[2]))
     try:
         from upath import UPath
 
         folder = UPath(f"{url[1]}://{url[2]}")
-        assert folder.fs is not None  # looks for the file system's own package
+        assert folder.fs is not None  # imports the package of this kind of URL
     except (ImportError, ValueError) as error:
-        said = " ".join(str(error).split())
-        raise DataError(f"{url[0]}: cannot be reached ({said}); pip install 'kpbench[remote]'") from None
+        reason = " ".join(str(error).split())
+        raise DataError(f"{url[0]}: cannot be reached ({reason}); pip install 'kpbench[remote]'") from None
     return folder  # type: ignore[return-value]
 
 
 def is_local(path: object) -> bool:
-    """Whether a path is one of this machine's file system, and not a URL's."""
+    """Return whether a path belongs to the file system of this machine, and not to a URL."""
     return isinstance(path, (str, Path))
 
 
 def refuse_overwrite(targets: Iterable[Path | None], sources: Iterable[Path] = ()) -> None:
-    """Refuse to write a file that the same command reads, or writes twice.
+    """Raise an error if a target is one of the sources, or if two targets are the same file.
 
     Raises
     ------
     DataError
-        Naming it.
+        The message names the target.
     """
     taken = {path.resolve() for path in sources}
     for target in targets:
@@ -120,28 +123,30 @@ def refuse_overwrite(targets: Iterable[Path | None], sources: Iterable[Path] = (
         taken.add(target.resolve())
 
 
-def require_own_folder(folder: Path, mark: str, what: str) -> None:
-    """Refuse to write among other files: a folder must be new, empty, or hold ``mark`` from an earlier run.
+def require_own_folder(folder: Path, mark: str, purpose: str) -> None:
+    """Raise an error unless a folder is new, is empty, or holds the file ``mark`` of an earlier run.
 
     Raises
     ------
     DataError
-        Naming one of the other files; or the folder, if it is a file.
+        The message names one of the other files, or says that the folder is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder}: a file, expected a folder")
     others = sorted(path.name for path in folder.glob("*") if not path.name.startswith("."))
     if others and not (folder / mark).exists():
-        raise DataError(f"{folder}: holds other files ({others[0]}, ...), expected a new or an empty folder for {what}")
+        raise DataError(
+            f"{folder}: holds other files ({others[0]}, ...), expected a new or an empty folder for {purpose}"
+        )
 
 
 def make_folder(folder: Path) -> Path:
-    """Make a folder and those above it unless they exist, and return it.
+    """Make a folder and its parents unless they exist, and return the folder.
 
     Raises
     ------
     DataError
-        If the folder cannot be made. The message names it.
+        If the folder cannot be made. The message names the folder.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -151,17 +156,18 @@ def make_folder(folder: Path) -> Path:
 
 
 def write_atomic(path: Path, data: bytes | memoryview) -> None:
-    """Write a file whole or not at all: temporary sibling, fsync, rename, fsync of the folder.
+    """Write a file whole or not at all.
 
-    Under a URL it is put in one piece, which object stores do whole or not at all.
+    On this machine: write a temporary file in the same folder, fsync the file, rename it, fsync the folder. At a URL:
+    put the file in one piece. Object stores write one piece whole or not at all.
 
     Raises
     ------
     DataError
-        If the disk is full or the folder cannot be written; nothing is left behind.
+        If the disk is full or the folder cannot be written. No file is left behind.
     """
     if not is_local(path):
-        with _reaching(path):
+        with _remote_errors(path):
             path.write_bytes(bytes(data))
         return
     try:
@@ -177,20 +183,20 @@ def write_atomic(path: Path, data: bytes | memoryview) -> None:
             with suppress(OSError):
                 os.unlink(name)
             raise
-        with suppress(OSError):  # not every file system lets a folder be opened
+        with suppress(OSError):  # some file systems do not let a folder be opened
             folder = os.open(path.parent, os.O_RDONLY)
             try:
                 os.fsync(folder)
             finally:
                 os.close(folder)
     except OSError as error:
-        why = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
-        raise DataError(f"{path}: cannot be written, {why}") from None
+        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
+        raise DataError(f"{path}: cannot be written, {reason}") from None
 
 
 @contextmanager
-def _reaching(path: Path) -> Iterator[None]:
-    """Turn whatever a remote file system raises into one line."""
+def _remote_errors(path: Path) -> Iterator[None]:
+    """Turn every error of a remote file system into one line."""
     try:
         yield
     except Exception as error:

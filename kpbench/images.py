@@ -1,4 +1,7 @@
-"""Images from where a user has them: a file, a folder, a video, a camera."""
+"""Images: read a file, a folder, a video or a camera; write PNG, JPEG and video; convert and resize.
+
+Images are uint8, grey (H, W) or RGB (H, W, 3).
+"""
 
 from __future__ import annotations
 
@@ -14,15 +17,23 @@ from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, write_atomic
 from kpbench.types import UInt8
 
-VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
-PICTURES = (".png", ".jpg", ".jpeg")
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # of a single image that is written
+DEFAULT_FPS = 25.0  # of a camera that names no frame rate
 
 
 @dataclass(frozen=True)
 class ImageSource:
-    """Named images in order: RGB or grey uint8, or None for a file that cannot be decoded.
+    """Named images in order.
 
-    ``length`` is their number, None where nobody knows it; ``fps`` that of a video or camera, else None.
+    Attributes
+    ----------
+    images : iterator of (str, ndarray or None)
+        Name and pixels of each image; None for a file that cannot be decoded.
+    length : int or None
+        Number of images; None if unknown, as for a camera.
+    fps : float or None
+        Frames per second of a video or camera; None for files.
     """
 
     images: Iterator[tuple[str, UInt8 | None]]
@@ -30,30 +41,33 @@ class ImageSource:
     fps: float | None = None
 
 
-def open_images(source: str, but: Path | None = None) -> ImageSource:
-    """Images of ``camera:N``, a video file, an image file, or a folder (by name, subfolders too, ``but`` for one).
+def open_images(source: str, exclude: Path | None = None) -> ImageSource:
+    """Open ``camera:N``, a video file, an image file, or a folder of images.
+
+    Images of a folder come in the order of their names, those of its subfolders included. Images below the folder
+    ``exclude`` are left out.
 
     Raises
     ------
     DataError
-        If there is nothing, or nothing that can be opened.
+        If the source does not exist, holds no image, or cannot be opened.
     """
     path = Path(source)
     if source.startswith("camera:"):
         number = source.removeprefix("camera:")
         if not number.isdecimal():
             raise DataError(f"{source}: expected camera:0, camera:1, …")
-        return _video(cv2.VideoCapture(int(number)), source, None)
+        return _open_video(cv2.VideoCapture(int(number)), source, None)
     if path.is_dir():
-        files = image_files(path, but)
+        files = image_files(path, exclude)
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
         return ImageSource(((name, _decode(path / name)) for name in files), len(files))
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
-    if path.suffix.lower() in VIDEOS:
+    if path.suffix.lower() in VIDEO_SUFFIXES:
         capture = cv2.VideoCapture(str(path))
-        return _video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        return _open_video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
     image = _decode(path)
     if image is None:
         raise DataError(f"{path}: cannot be decoded as an image")
@@ -61,12 +75,12 @@ def open_images(source: str, but: Path | None = None) -> ImageSource:
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:
-    """Refuse to write images over those that are read.
+    """Raise an error if the target folder is the source, or holds the source file.
 
     Raises
     ------
     DataError
-        If the target is the source, or the folder that it lies in.
+        The message names the target.
     """
     given = Path(source).resolve()
     if target.resolve() in (given, *([given.parent] if given.is_file() else [])):
@@ -81,7 +95,7 @@ def _decode(path: Path) -> UInt8 | None:
     return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> ImageSource:
+def _open_video(capture: cv2.VideoCapture, name: str, length: int | None) -> ImageSource:
     if not capture.isOpened():
         raise DataError(f"{name}: cannot be opened as a video")
 
@@ -95,46 +109,60 @@ def _video(capture: cv2.VideoCapture, name: str, length: int | None) -> ImageSou
             yield f"{number:08d}.png", np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
             number += 1
 
-    return ImageSource(frames(), length if length and length > 0 else None, capture.get(cv2.CAP_PROP_FPS) or 25.0)
+    known_length = length if length and length > 0 else None
+    return ImageSource(frames(), known_length, capture.get(cv2.CAP_PROP_FPS) or DEFAULT_FPS)
 
 
 @contextmanager
 def image_writer(
     target: Path | None, count: int | None, fps: float | None = None
 ) -> Iterator[Callable[[str, UInt8], None]]:
-    """Write RGB images: into a folder as PNG under their names, as a video (.mp4), or the only one as a picture (.png).
+    """Give a function that writes RGB images under their names.
 
-    ``count`` is how many there will be, None where nobody knows it.
+    The target decides the form: a folder of PNG files, one video (.mp4), or one image (.png, .jpg). No target writes
+    nothing.
+
+    Parameters
+    ----------
+    target : Path or None
+    count : int or None
+        Number of images; None if unknown.
+    fps : float or None
+        Frames per second of a video.
 
     Raises
     ------
     DataError
-        If the target cannot be written.
+        If the target cannot be written, or is one image file while ``count`` is not 1.
     """
     if target is None:
         yield lambda name, image: None
         return
-    file = target.suffix.lower() in (*VIDEOS, *PICTURES) and not target.is_dir()
-    if file and target.suffix.lower() in PICTURES and count != 1:
+    suffix = target.suffix.lower()
+    to_file = suffix in (*VIDEO_SUFFIXES, *DRAWING_SUFFIXES) and not target.is_dir()
+    if to_file and suffix in DRAWING_SUFFIXES and count != 1:
         raise DataError(f"{target}: there is more than one image, expected a folder to draw into")
-    make_folder(target.parent if file else target)
-    if not file or target.suffix.lower() in PICTURES:
-
-        def write_file(name: str, image: UInt8) -> None:
-            path = target if file else target / (name if name.endswith(".png") else f"{name}.png")
-            make_folder(path.parent)
-            # OpenCV's own writer leaves half of a file on a full disk, and ends the process on names that are not UTF-8
-            write_atomic(path, _encode(image, path.suffix.lower(), []))
-
-        yield write_file
+    make_folder(target.parent if to_file else target)
+    if to_file and suffix in VIDEO_SUFFIXES:
+        with _video_writer(target, fps or DEFAULT_FPS) as write_frame:
+            yield write_frame
         return
-    with _video_writer(target, fps or 25.0) as write:
-        yield write
+
+    def write_file(name: str, image: UInt8) -> None:
+        path = target if to_file else target / (name if name.endswith(".png") else f"{name}.png")
+        make_folder(path.parent)
+        # cv2.imwrite leaves half a file on a full disk, and ends the process if a name is not UTF-8
+        write_atomic(path, _encode(image, path.suffix.lower(), []))
+
+    yield write_file
 
 
 @contextmanager
 def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], None]]:
-    """Frames as a video, whole or not at all: OpenCV says nothing of a disk that is full."""
+    """Give a function that appends a frame to a video, which is written whole or not at all.
+
+    OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
+    """
     part = target.with_name(f".{target.stem}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
     sizes = set[tuple[int, int]]()
@@ -144,7 +172,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
         nonlocal written
         size = (image.shape[1], image.shape[0])
         sizes.add(size)
-        if len(sizes) > 1:  # which OpenCV would leave out
+        if len(sizes) > 1:  # OpenCV would silently drop the frame
             raise DataError(f"{target}: {name} is of another size than those before, expected a folder to draw into")
         if not video:
             video.append(cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size))
@@ -168,7 +196,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
 
 
 def resize(grey: UInt8, width: int, height: int) -> UInt8:
-    """The image in another size; the outer corners of its corner pixels stay where they are."""
+    """Return a grey image in another size; the outer corners of its corner pixels keep their places."""
     if grey.shape == (height, width):
         return grey
     how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
@@ -176,12 +204,12 @@ def resize(grey: UInt8, width: int, height: int) -> UInt8:
 
 
 def to_grey(image: UInt8) -> UInt8:
-    """(H, W) or RGB (H, W, 3) to (H, W).
+    """Return an image (H, W) or RGB (H, W, 3) as grey (H, W).
 
     Raises
     ------
     DataError
-        If the array is no such image.
+        If the array has another shape or type.
     """
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise DataError(f"image of shape {image.shape} and type {image.dtype}, expected uint8 (H, W) or (H, W, 3)")
@@ -189,7 +217,10 @@ def to_grey(image: UInt8) -> UInt8:
 
 
 def decode_photo(path: Path, channels: int) -> UInt8 | None:
-    """Decode a photograph as grey (channels 1) or RGB (3), whatever its EXIF says; None if it cannot be decoded."""
+    """Return a photograph as grey (``channels`` 1) or RGB (``channels`` 3), not rotated by its EXIF data.
+
+    None stands for a file that cannot be decoded, or whose image has a side under 8 px.
+    """
     flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         data = np.fromfile(path, np.uint8)
@@ -202,12 +233,12 @@ def decode_photo(path: Path, channels: int) -> UInt8 | None:
 
 
 def encode_png(image: UInt8) -> bytes:
-    """Return a grey image (H, W) or an RGB image (H, W, 3) as the content of a PNG file."""
+    """Return a grey or RGB image as the content of a PNG file."""
     return _encode(image, ".png", [])
 
 
 def encode_jpeg(image: UInt8, quality: int) -> bytes:
-    """Return a grey image (H, W) or an RGB image (H, W, 3) as the content of a JPEG file; quality is from 1 to 100."""
+    """Return a grey or RGB image as the content of a JPEG file; ``quality`` is from 1 to 100."""
     return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
 
 

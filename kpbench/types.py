@@ -1,7 +1,8 @@
-"""The tables that pass between the stages: true keypoints, and detections in one image and in many.
+"""Tables that pass between the stages: true keypoints, and detections of one image and of many images.
 
-They are defined here, below everything that makes or reads them, so that the evaluator never
-needs the generator.
+The tables stand below the stages that make and read them. The evaluator therefore never imports the generator.
+
+Coordinates are px. The centre of the top-left pixel is (0, 0), x points right and y points down.
 """
 
 from __future__ import annotations
@@ -23,34 +24,46 @@ UInt8 = NDArray[np.uint8]
 
 KEYPOINT_DTYPE = np.dtype(
     [
-        ("x", "<f8"),  # px; the centre of the top-left pixel is (0, 0), x right, y down
+        ("x", "<f8"),  # px, of the disc's centre
         ("y", "<f8"),
         ("patch_id", "<i2"),
-        ("radius_major", "<f4"),  # px, semi-axes of the projected disc
+        ("radius_major", "<f4"),  # px, semi-axes of the ellipse that the disc is in the image
         ("radius_minor", "<f4"),
         ("axis_angle", "<f4"),  # degrees from +x towards +y, of the major axis, in [0, 180)
-        ("H_patch2image", "<f8", (3, 3)),  # unit disc (patch frame) to px
-        ("visible", "<f4"),  # fraction of the disc inside the image and not occluded
+        ("H_patch2image", "<f8", (3, 3)),  # homography from the patch frame (unit disc) to px
+        ("visible", "<f4"),  # fraction of the disc that lies inside the image and is not occluded
         ("contrast", "<f4"),  # grey levels, white minus black, after deterioration
     ]
 )
-"""One true keypoint: the record type of ``/keypoints`` in a shard."""
+"""Record type of one true keypoint, as in ``/keypoints`` of a shard."""
 
 
 @dataclass(frozen=True)
 class Detections:
-    """What a detector found in one image.
+    """Detections of one image.
 
     Attributes
     ----------
-    xy : ndarray of shape (n, 2), float64, px in the pixel convention of :mod:`kpbench.geometry.homography`.
-    score : ndarray of shape (n,), float64, higher is surer.
-    patch_id : ndarray of shape (n,), int64, or None from a detector that tells no identities.
+    xy : ndarray of shape (n, 2), float64
+        Points in px. The centre of the top-left pixel is (0, 0).
+    score : ndarray of shape (n,), float64
+        Confidence. A higher score means a surer detection.
+    patch_id : ndarray of shape (n,), int64, or None
+        Identity of each point; None if the detector does not identify patches.
 
     Raises
     ------
     ValueError
-        If the shapes do not agree.
+        If the shapes disagree, or an identity is no whole number.
+
+    Examples
+    --------
+    >>> from kpbench import Detections
+    >>> found = Detections(xy=[[10.5, 20.0], [30.0, 5.25]], score=[0.9, 0.4], patch_id=[2, 0])
+    >>> len(found)
+    2
+    >>> found[found.score > 0.5].xy
+    array([[10.5, 20. ]])
     """
 
     xy: Float
@@ -58,19 +71,19 @@ class Detections:
     patch_id: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
+        assign = object.__setattr__
         xy = np.asarray(self.xy, np.float64)
         if xy.size and (xy.ndim != 2 or xy.shape[1] != 2):
             raise ValueError(f"xy has shape {xy.shape}, expected (n, 2)")
-        set_(self, "xy", xy.reshape(-1, 2))
-        set_(self, "score", np.asarray(self.score, np.float64).reshape(-1))
+        assign(self, "xy", xy.reshape(-1, 2))
+        assign(self, "score", np.asarray(self.score, np.float64).reshape(-1))
         if len(self.score) != len(self.xy):
             raise ValueError(f"{len(self.xy)} points have {len(self.score)} scores, expected as many")
         if self.patch_id is not None:
             ids = np.asarray(self.patch_id)
             if ids.size and not (np.isfinite(ids) & (ids == np.rint(ids))).all():
                 raise ValueError("patch_id holds numbers that are not whole")
-            set_(self, "patch_id", ids.astype(np.int64).reshape(-1))
+            assign(self, "patch_id", ids.astype(np.int64).reshape(-1))
             if ids.size != len(self.xy):
                 raise ValueError(f"{len(self.xy)} points have {ids.size} patch IDs, expected as many")
 
@@ -78,31 +91,46 @@ class Detections:
         return len(self.xy)
 
     def __getitem__(self, keep: Any) -> Detections:
-        """The detections that a mask, slice or index array keeps."""
+        """Return the detections that a mask, a slice or an index array selects."""
         ids = None if self.patch_id is None else self.patch_id[keep]
         return Detections(self.xy[keep], self.score[keep], ids)
 
     @classmethod
     def none(cls, with_ids: bool = True) -> Detections:
-        """No detection at all."""
+        """Return an empty table, with or without the column of identities."""
         empty = np.zeros(0, np.int64) if with_ids else None
         return cls(np.zeros((0, 2)), np.zeros(0), empty)
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The true keypoints of N images, as one table; image ``i`` owns rows ``offsets[i]:offsets[i + 1]``.
+    """True keypoints of N images as one table; image ``i`` owns the rows ``offsets[i]:offsets[i + 1]``.
 
     Attributes
     ----------
-    image_id : ndarray of shape (N,), int64, unique.
-    offsets : ndarray of shape (N + 1,), int64.
-    keypoints : ndarray of shape (offsets[-1],), :data:`KEYPOINT_DTYPE`.
-    condition : ndarray of shape (N,), str; "" where the images belong to no condition.
-    rung : ndarray of shape (N,), float64; the severity within the condition, nan where there is none.
-    scene_id : ndarray of shape (N,), int64; images of one base scene share it (bootstrap clusters).
+    image_id : ndarray of shape (N,), int64
+        Unique.
+    offsets : ndarray of shape (N + 1,), int64
+        First row of each image, and the number of all rows.
+    keypoints : ndarray of shape (offsets[-1],), KEYPOINT_DTYPE
+        One record per true keypoint.
+    condition : ndarray of shape (N,), str
+        Name of the condition that an image belongs to; "" for none.
+    rung : ndarray of shape (N,), float64
+        Severity within the condition; nan for none.
+    scene_id : ndarray of shape (N,), int64
+        Images of one base scene share this number. The bootstrap draws whole scenes.
     fingerprint : str
-        The dataset's fingerprint, "" if it has none.
+        Fingerprint of the dataset; "" for none.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> truth = kpbench.open_dataset("kpbench-data").truth
+    >>> len(truth)
+    6
+    >>> truth.keypoints.dtype == kpbench.KEYPOINT_DTYPE
+    True
     """
 
     image_id: NDArray[np.int64]
@@ -118,7 +146,19 @@ class Truth:
 
 
 class InvalidValue(PredictionsError):
-    """A value that cannot be: in which image (position), at which keypoint of it (or None), and why."""
+    """A value of a predictions table is impossible.
+
+    Attributes
+    ----------
+    image : int
+        Position of the image in the table.
+    keypoint : int or None
+        Position of the keypoint within the image; None if the value belongs to the image.
+    image_id : int
+        Identity of the image.
+    problem : str
+        The value and what was expected, without the place.
+    """
 
     def __init__(self, image: int, keypoint: int | None, image_id: int, problem: str) -> None:
         super().__init__(f"predictions[{image}] (image_id {image_id}): {problem}")
@@ -127,26 +167,41 @@ class InvalidValue(PredictionsError):
 
 @dataclass(frozen=True)
 class Predictions:
-    """Detections of N images as columns; image ``i`` owns rows ``offsets[i]:offsets[i + 1]``.
+    """Detections of N images as columns; image ``i`` owns the rows ``offsets[i]:offsets[i + 1]``.
 
     Attributes
     ----------
-    image_id : ndarray of shape (N,), int64, unique, 0 or more, in any order.
-    offsets : ndarray of shape (N + 1,), int64.
-    xy : ndarray of shape (K, 2), float64, px in the pixel convention of :mod:`kpbench.geometry.homography`.
-    score : ndarray of shape (K,), float64, higher is surer.
-    patch_id : ndarray of shape (K,), int64, 0 or more, or None from a detector that tells no identities.
+    image_id : ndarray of shape (N,), int64
+        Unique, 0 or more, in any order.
+    offsets : ndarray of shape (N + 1,), int64
+        First row of each image, and the number of all rows.
+    xy : ndarray of shape (K, 2), float64
+        Points in px. The centre of the top-left pixel is (0, 0).
+    score : ndarray of shape (K,), float64
+        Confidence. A higher score means a surer detection.
+    patch_id : ndarray of shape (K,), int64, or None
+        Identity of each point, 0 or more; None if the detector does not identify patches.
     detector : dict
-        Whatever names the detector, such as ``{"name": "superpoint", "version": "1"}``.
+        Name and settings of the detector, such as ``{"name": "superpoint", "version": "1"}``.
     dataset : str or None
         Path or fingerprint of the dataset.
     fingerprint : str or None
-        Fingerprint of the dataset, checked when scoring.
+        Fingerprint of the dataset. The evaluator compares the fingerprint with the dataset's own.
 
     Raises
     ------
     PredictionsError
-        If the columns do not fit each other or hold a value that cannot be; it names image and keypoint.
+        If the columns do not fit each other, or a value is impossible. The message names image and keypoint.
+
+    Examples
+    --------
+    >>> from kpbench import Detections, Predictions
+    >>> found = [Detections([[3.0, 4.0]], [0.9], [1]), Detections.none()]
+    >>> predictions = Predictions.from_detections(found, image_id=[7, 8])
+    >>> predictions.offsets.tolist()
+    [0, 1, 1]
+    >>> len(predictions.detections())
+    2
     """
 
     image_id: Int
@@ -159,13 +214,13 @@ class Predictions:
     fingerprint: str | None = None
 
     def __post_init__(self) -> None:
-        set_ = object.__setattr__
-        set_(self, "image_id", np.ascontiguousarray(self.image_id, np.int64).reshape(-1))
-        set_(self, "offsets", np.ascontiguousarray(self.offsets, np.int64).reshape(-1))
-        set_(self, "xy", np.ascontiguousarray(self.xy, np.float64).reshape(-1, 2))
-        set_(self, "score", np.ascontiguousarray(self.score, np.float64).reshape(-1))
+        assign = object.__setattr__
+        assign(self, "image_id", np.ascontiguousarray(self.image_id, np.int64).reshape(-1))
+        assign(self, "offsets", np.ascontiguousarray(self.offsets, np.int64).reshape(-1))
+        assign(self, "xy", np.ascontiguousarray(self.xy, np.float64).reshape(-1, 2))
+        assign(self, "score", np.ascontiguousarray(self.score, np.float64).reshape(-1))
         if self.patch_id is not None:
-            set_(self, "patch_id", np.ascontiguousarray(self.patch_id, np.int64).reshape(-1))
+            assign(self, "patch_id", np.ascontiguousarray(self.patch_id, np.int64).reshape(-1))
         _check(self)
 
     def __len__(self) -> int:
@@ -180,12 +235,21 @@ class Predictions:
         dataset: str | None = None,
         fingerprint: str | None = None,
     ) -> Predictions:
-        """One :class:`Detections` an image, to columns; ``image_id`` is 0, 1, 2, … where it is not given.
+        """Return the columns for one :class:`Detections` per image.
+
+        Parameters
+        ----------
+        detections : iterable of Detections
+            One element per image. All elements have identities, or none has.
+        image_id : sequence of int, optional
+            0, 1, 2, … if left out.
+        detector, dataset, fingerprint
+            See :class:`Predictions`.
 
         Raises
         ------
         PredictionsError
-            As the class does, and if some images with detections have identities and others have none.
+            As :class:`Predictions`, and if some images with detections have identities and others have none.
         """
         found = list(detections)
         named = [d.patch_id is not None for d in found if len(d)]
@@ -204,7 +268,7 @@ class Predictions:
         )
 
     def detections(self) -> list[Detections]:
-        """The same as one :class:`Detections` an image, in the order of ``image_id``."""
+        """Return one :class:`Detections` per image, in the order of ``image_id``."""
         return [
             Detections(self.xy[a:b], self.score[a:b], None if self.patch_id is None else self.patch_id[a:b])
             for a, b in pairwise(self.offsets.tolist())
@@ -212,12 +276,12 @@ class Predictions:
 
 
 def offsets_of(counts: Sequence[int] | Int) -> Int:
-    """Where each image's rows begin, and where the last one's end: (N + 1,) from (N,) counts."""
+    """Return the first row of each image and the number of all rows, shape (N + 1,), from N counts of rows."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
 
 
 def _check(p: Predictions) -> None:
-    """Every rule that the numbers must keep, for all formats and for arrays made in memory."""
+    """Check every rule of the columns, for files of all formats and for arrays made in memory."""
     n, k = len(p.image_id), len(p.xy)
     if len(p.offsets) != n + 1 or p.offsets[0] != 0 or p.offsets[-1] != k or np.any(np.diff(p.offsets) < 0):
         raise PredictionsError(f"offsets do not run from 0 to {k} keypoints in {n} images")
@@ -232,7 +296,7 @@ def _check(p: Predictions) -> None:
     repeated = np.flatnonzero(np.diff(p.image_id[order]) == 0)
     if len(repeated):
         first, second = order[repeated[0]], order[repeated[0] + 1]
-        raise InvalidValue(int(second), None, int(p.image_id[second]), f"the image is there twice, first at {first}")
+        raise InvalidValue(int(second), None, int(p.image_id[second]), f"the image occurs twice, first at {first}")
     for name, column, valid, expected in (
         ("keypoints", p.xy, np.isfinite(p.xy), "two finite numbers"),
         ("scores", p.score, np.isfinite(p.score), "a finite number"),

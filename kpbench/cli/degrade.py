@@ -51,7 +51,7 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     if (source / "dataset.json").exists():
         raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
     refuse_same_folder(source, out)
-    images = open_images(str(source), but=out)
+    images = open_images(str(source), exclude=out)
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):
             click.echo(f"{path} {json.dumps(applied)}")

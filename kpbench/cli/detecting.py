@@ -93,7 +93,7 @@ def _run(
     from kpbench.images import open_images
 
     if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):
-        images = open_images(source, but=overlay)
+        images = open_images(source, exclude=overlay)
         with progress_bar(images.length, "detect") as progress:
             return predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
     dataset = open_dataset(source)

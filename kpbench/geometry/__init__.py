@@ -1,6 +1,19 @@
-"""Frames, homographies, a camera, exact outlines and the area that they cover; *the* pixel convention.
+"""Frames, homographies, a camera, exact outlines and the area that outlines cover.
 
-x right, y down, float64 px. The centre of the top-left pixel is (0, 0), as in OpenCV.
+Conventions of all rooms
+------------------------
+* Image frame: px, x right, y down. The centre of the top-left pixel is (0, 0), as in OpenCV.
+* Patch frame: the patch is the unit disc, u right, v down. Angles grow from +u towards +v.
+* Board frame: mm, x right, y down, z away from the viewer. The origin is the board's centre.
+* Camera frame: x right, y down, z forward.
+
+Examples
+--------
+>>> from kpbench.geometry import circle, flatten, rasterise
+>>> disc = flatten(circle(10.0, 10.0, 5.0), tolerance=1e-4)
+>>> (coverage,) = rasterise([disc], [(0, 0, 21, 21)])
+>>> round(float(coverage.sum() / 5.0**2), 5)
+3.14159
 """
 
 import lazy_loader

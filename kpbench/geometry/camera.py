@@ -1,4 +1,4 @@
-"""A pinhole camera with lens distortion, as OpenCV has it."""
+"""A pinhole camera with OpenCV's lens distortion."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kpbench.types import Float
 
 
 def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:
-    """Rotation by z first, then y, then x about the fixed axes: ``Rx @ Ry @ Rz``, shape (3, 3)."""
+    """Return the rotation about the fixed axes z, then y, then x: ``Rx @ Ry @ Rz``, shape (3, 3)."""
     (cx, cy, cz), (sx, sy, sz) = np.cos(a := np.radians([x_deg, y_deg, z_deg])), np.sin(a)
     Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     Ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
@@ -20,7 +20,7 @@ def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:
 
 
 def plane_to_camera(R_plane2camera: Float, t_camera: ArrayLike) -> Float:
-    """The 3x3 matrix ``[r1 r2 t]`` that takes (x, y, 1) on a plane to the camera frame."""
+    """Return the matrix ``[r1 r2 t]``, shape (3, 3), that maps (x, y, 1) on a plane to the camera frame."""
     return np.column_stack([R_plane2camera[:, :2], np.asarray(t_camera, np.float64)])
 
 
@@ -29,9 +29,30 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera: image size and focal length in px, principal point at the image's centre.
+    """A camera whose principal point is the centre of the image.
 
-    ``distortion`` holds OpenCV's (k1, k2, p1, p2, k3), radial and tangential (Brown 1966); 0 is a pinhole.
+    A point at (x, y, z) of the camera frame has the ray (x / z, y / z). :meth:`distort` maps rays to px by the model of
+    Brown (1966) in OpenCV's form, with ``r² = x² + y²``::
+
+        x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
+        y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
+
+    Attributes
+    ----------
+    width_px, height_px : int
+        Size of the image.
+    focal_px : float
+        Focal length in px.
+    distortion : tuple of 5 float
+        OpenCV's (k1, k2, p1, p2, k3). All zero for a pinhole camera.
+
+    Examples
+    --------
+    >>> from kpbench.geometry import Camera
+    >>> camera = Camera(width_px=640, height_px=480, focal_px=700.0)
+    >>> camera.project([[0.0, 0.0, 2.0], [0.2, 0.0, 2.0]])
+    array([[319.5, 239.5],
+           [389.5, 239.5]])
     """
 
     width_px: int
@@ -41,17 +62,17 @@ class Camera:
 
     @property
     def K(self) -> Float:
-        """Intrinsic matrix, camera frame to px, ndarray of shape (3, 3)."""
+        """Intrinsic matrix from the camera frame to px, ndarray of shape (3, 3)."""
         cx, cy = (self.width_px - 1) / 2, (self.height_px - 1) / 2
         return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
 
     def project(self, points_camera: ArrayLike) -> Float:
-        """Points of the camera frame, shape (N, 3), z > 0, to px with distortion, shape (N, 2)."""
+        """Return the px, shape (N, 2), of points of the camera frame, shape (N, 3), z > 0."""
         points = np.asarray(points_camera, np.float64)
         return self.distort(points[:, :2] / points[:, 2:])
 
     def distort(self, rays: Float) -> Float:
-        """Points at distance 1 (x / z, y / z), shape (N, 2), to px, shape (N, 2)."""
+        """Return the px, shape (N, 2), of rays (x / z, y / z), shape (N, 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(rays, np.float64).T
         r2 = x * x + y * y
@@ -61,18 +82,18 @@ class Camera:
         return np.asarray(self.focal_px * np.column_stack([xd, yd]) + self.K[:2, 2])
 
     def local_K(self, ray: ArrayLike) -> Float:
-        """The intrinsic matrix that agrees with :meth:`distort` at one point (x / z, y / z) to first order.
+        """Return the intrinsic matrix, shape (3, 3), that equals :meth:`distort` to first order near one ray.
 
-        Without distortion this is ``K`` everywhere.
+        The matrix is ``K`` at every ray if the camera has no distortion.
         """
         k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(ray, np.float64)
         r2 = x * x + y * y
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # of the radial factor along x is x * slope
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / dx is x * slope, d radial / dy is y * slope
         J = self.focal_px * np.array([
             [radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, x * y * slope + 2 * p1 * x + 2 * p2 * y],
             [x * y * slope + 2 * p1 * x + 2 * p2 * y, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x],
         ])  # fmt: skip
-        at = self.distort(np.array([[x, y]]))[0]
-        return np.vstack([np.column_stack([J, at - J @ (x, y)]), [0.0, 0.0, 1.0]])
+        point = self.distort(np.array([[x, y]]))[0]
+        return np.vstack([np.column_stack([J, point - J @ (x, y)]), [0.0, 0.0, 1.0]])

@@ -1,9 +1,12 @@
 """Exact area coverage of polygons on a pixel grid.
 
-Every pixel gets the area of the polygon inside it, without sampling. Each edge is cut where it
-crosses a pixel border; a piece adds its signed area to its own pixel and its height to all pixels
-on its right, which one running sum along the rows spreads. The cost grows with the outline's
-length, not with the area.
+Each pixel gets the area of the polygon within the pixel, without sampling. The algorithm:
+
+1. Cut every edge where the edge crosses a pixel border.
+2. Let each piece add its signed area to its own pixel, and its height to the pixel on the right.
+3. Sum along the rows. The sum carries the height of each piece to all pixels on the right of the piece.
+
+The cost grows with the length of the outline, not with its area.
 """
 
 from __future__ import annotations
@@ -18,31 +21,60 @@ from numpy.typing import NDArray
 from kpbench.types import Float
 
 Box = tuple[int, int, int, int]
-"""Columns and rows of a pixel rectangle: (x, y, width, height); may reach outside the image."""
+"""A rectangle of pixels (x, y, width, height), which may reach outside the image."""
 
 
 def bounding_box(polygons: Sequence[Float]) -> Box:
-    """The smallest box that :func:`rasterise` accepts for these polygons (a one-pixel margin)."""
+    """Return the smallest box that :func:`rasterise` accepts for these polygons, one pixel of margin included.
+
+    Parameters
+    ----------
+    polygons : sequence of ndarray of shape (N, 2)
+        Vertices in px.
+
+    Returns
+    -------
+    tuple of 4 int
+        x and y of the top-left pixel, width and height.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.geometry import bounding_box
+    >>> bounding_box([np.array([[0.0, 0.0], [2.0, 0.0], [0.0, 1.0]])])
+    (-1, -1, 5, 4)
+    """
     x, y = np.concatenate(list(polygons)).T
     left, top = math.floor(x.min() + 0.5) - 1, math.floor(y.min() + 0.5) - 1
     return left, top, math.floor(x.max() + 0.5) + 2 - left, math.floor(y.max() + 0.5) + 2 - top
 
 
 def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[Float]:
-    """Rasterise several regions, each into a box of its own.
+    """Return the fraction of each pixel that a region covers, for several regions in boxes of their own.
 
     Parameters
     ----------
     regions : sequence of sequences of ndarray of shape (N, 2)
-        Polygons in px (pixel centres at integers). Within one region, holes run the other way round
-        than outer borders; which way round the outer borders run does not matter.
-    boxes : sequence of Box
-        One a region, at least :func:`bounding_box` of it.
+        Polygons of each region, in px. The centres of pixels are at whole numbers. Within a region, holes run in the
+        direction opposite to the outer borders. The outer borders may run in either direction.
+    boxes : sequence of (int, int, int, int)
+        x, y, width and height of one box per region. The box contains the region's :func:`bounding_box`.
 
     Returns
     -------
     list of ndarray of shape (height, width), float64
-        Covered fraction of each pixel, in [0, 1].
+        Covered fractions in [0, 1], one array per region.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.geometry import rasterise
+    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    >>> rasterise([[square]], [(-1, -1, 4, 4)])[0]
+    array([[0.  , 0.  , 0.  , 0.  ],
+           [0.  , 0.25, 0.25, 0.  ],
+           [0.  , 0.25, 0.25, 0.  ],
+           [0.  , 0.  , 0.  , 0.  ]])
     """
     polygons = [polygon for region in regions for polygon in region]
     owner = np.repeat(np.arange(len(regions)), [sum(map(len, region)) for region in regions])
@@ -53,60 +85,62 @@ def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[
 
 
 def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
-    """:func:`rasterise` of regions given by their edges.
+    """Return what :func:`rasterise` returns, for regions that are given by their edges.
 
     Parameters
     ----------
-    start, end : ndarray of shape (2, N), rows x and y, px
-    owner : ndarray of shape (N,)
-        The place in ``boxes`` of the region that an edge belongs to; the edges of each close up.
-    boxes : sequence of Box
+    start, end : ndarray of shape (2, N), float64
+        First and last point of each edge in px; the rows are x and y.
+    owner : ndarray of shape (N,), int64
+        Index into ``boxes`` of the region that each edge belongs to. The edges of a region form closed polygons.
+    boxes : sequence of (int, int, int, int)
+        As in :func:`rasterise`.
     """
     x, y, width, height = np.array(boxes, np.int64).reshape(-1, 4).T
     base = np.concatenate([[0], np.cumsum(width * height)])
     corner = np.stack([x - 0.5, y - 0.5])[:, owner]
     signed = _accumulate(start - corner, end - corner, base[owner], width[owner], int(base[-1]))
-    # a region's running sum ends at zero, so one sum serves them all; abs, because outlines may run either way round
+    # the sum over a region is zero, so a single running sum serves all regions; abs, as borders run in either direction
     covered = np.cumsum(signed)
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
     return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
 
 
 def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDArray[np.int64], total: int) -> Float:
-    """Signed area of every pixel, and height for those on its right, from edges in box pixels.
+    """Return an array whose running sum along the rows is the signed coverage.
 
-    Pixel i spans [i, i + 1). The running sum of the result along the rows is the coverage.
+    The edges are in pixels of their box, where pixel i spans [i, i + 1).
     """
     step = end - start
-    # parts shorter than a pixel, which cross one border of a kind at most
+    # divide edges into parts shorter than a pixel: a part crosses at most one vertical and one horizontal border
     parts = np.maximum(np.abs(step[0]), np.abs(step[1])).astype(np.int64) + 1
-    which = np.repeat(np.arange(len(parts)), parts)
-    if len(which) > len(parts):
-        nth = np.arange(len(which)) - np.repeat(np.cumsum(parts) - parts, parts)
-        step = step[:, which] / parts[which]
-        start, offset, stride = start[:, which] + nth * step, offset[which], stride[which]
+    edge_of_part = np.repeat(np.arange(len(parts)), parts)
+    if len(edge_of_part) > len(parts):
+        nth = np.arange(len(edge_of_part)) - np.repeat(np.cumsum(parts) - parts, parts)
+        step = step[:, edge_of_part] / parts[edge_of_part]
+        start, offset, stride = start[:, edge_of_part] + nth * step, offset[edge_of_part], stride[edge_of_part]
         end = start + step
     first, last = np.floor(start), np.floor(end)
     with np.errstate(divide="ignore", invalid="ignore"):
         cut = np.where(first != last, (np.maximum(first, last) - start) / step, 0.0)
     early, late = np.minimum(cut[0], cut[1]), np.maximum(cut[0], cut[1])
-    # up to three pieces: to the first border, between the two, and on to the end, which every part has
-    one, two = np.flatnonzero(early), np.flatnonzero(late > early)
-    edge = np.concatenate([one, two, np.arange(len(late))])
-    begin = np.concatenate([np.zeros(len(one)), early[two], late])
-    share = np.concatenate([early[one], late[two], np.ones(len(late))]) - begin
-    across = step[:, edge]
-    middle = start[:, edge] + (begin + 0.5 * share) * across
+    # each part has up to three pieces: to the first border, between both borders, from the last border to the end
+    has_first, has_second = np.flatnonzero(early), np.flatnonzero(late > early)
+    part = np.concatenate([has_first, has_second, np.arange(len(late))])
+    begin = np.concatenate([np.zeros(len(has_first)), early[has_second], late])
+    share = np.concatenate([early[has_first], late[has_second], np.ones(len(late))]) - begin
+    along = step[:, part]
+    middle = start[:, part] + (begin + 0.5 * share) * along
     pixel = np.floor(middle)
-    height = share * across[1]
+    height = share * along[1]
     right = height * (middle[0] - pixel[0])
-    index = (offset[edge] + pixel[1] * stride[edge] + pixel[0]).astype(np.int64)
+    index = (offset[part] + pixel[1] * stride[part] + pixel[0]).astype(np.int64)
     weights: Float = np.concatenate([height - right, right])
     return np.asarray(np.bincount(np.concatenate([index, index + 1]), weights, total + 1)[:total], np.float64)
 
 
 def clip_to_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Slices of the image and of the box for the part of a box that lies in the image."""
+    """Return the slices of the image, and those of the box, for the part of a box that lies in the image."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
     x1, y1 = max(x0, x1), max(y0, y1)

@@ -1,13 +1,14 @@
-"""Points, homographies, ellipses, camera and pose, and *the* pixel convention.
+"""Homographies, the ellipses that discs become under them, and *the* pixel convention.
 
 Conventions
 -----------
-* Image frame: x right, y down, float64 px, the **centre** of the top-left pixel is (0, 0) (OpenCV).
+* Image frame: float64 px, x right, y down. The **centre** of the top-left pixel is (0, 0), as in OpenCV.
   Pixel (column j, row i) covers ``[j - 0.5, j + 0.5] x [i - 0.5, i + 0.5]``.
-* Patch frame: the patch is the unit disc; u right, v down. Angles grow from +u towards +v,
-  which is clockwise for somebody who looks at the patch.
-* Board frame: mm, x right, y down, z away from the viewer; the origin is the board's centre.
-* Camera frame: x right, y down, z forward. ``H_a2b`` maps frame a to frame b.
+* Patch frame: the patch is the unit disc, u right, v down. Angles grow from +u towards +v, which is clockwise for a
+  person who looks at the patch.
+* Board frame: mm, x right, y down, z away from the viewer. The origin is the board's centre.
+* Camera frame: x right, y down, z forward.
+* ``H_a2b`` maps frame a to frame b.
 """
 
 from __future__ import annotations
@@ -26,11 +27,23 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
     Parameters
     ----------
     H_a2b : ndarray of shape (3, 3)
+        Homography from frame a to frame b.
     points_a : array_like of shape (N, 2)
+        Points in frame a.
 
     Returns
     -------
-    ndarray of shape (N, 2)
+    ndarray of shape (N, 2), float64
+        Points in frame b.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.geometry import project
+    >>> H_patch2image = np.array([[20.0, 0.0, 100.0], [0.0, 10.0, 50.0], [0.0, 0.0, 1.0]])
+    >>> project(H_patch2image, [[0.0, 0.0], [1.0, 0.0]])
+    array([[100.,  50.],
+           [120.,  50.]])
     """
     points = np.asarray(points_a, np.float64)
     mapped = points @ H_a2b[:, :2].T + H_a2b[:, 2]
@@ -39,7 +52,7 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
 
 @dataclass(frozen=True)
 class Ellipse:
-    """An ellipse in px: centre, semi-axes, and the angle of the major axis in [0, 180) degrees."""
+    """An ellipse: centre and semi-axes in px, angle of the major axis from +x towards +y in [0, 180) degrees."""
 
     x: float
     y: float
@@ -49,22 +62,38 @@ class Ellipse:
 
 
 def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
-    """Images of the unit circle under many homographies.
+    """Return the ellipses that the unit circle becomes under many homographies.
 
-    The dual conic of the unit circle is diag(1, 1, -1); under H it becomes H C* Hᵀ (Hartley and
-    Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). Its centre is *not* the image of the
-    disc's centre unless H is affine.
+    The dual conic of the unit circle is ``C* = diag(1, 1, -1)``. Its image under H is ``H C* Hᵀ`` (Hartley and
+    Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). The centre of the ellipse is *not* the image of the disc's
+    centre, unless H is affine.
 
     Parameters
     ----------
     H_patch2image : ndarray of shape (N, 3, 3)
+        Homographies from the unit disc to px.
 
     Returns
     -------
-    centre : ndarray of shape (N, 2), px
-    major, minor : ndarray of shape (N,), semi-axes, px
-    angle_deg : ndarray of shape (N,), of the major axis, in [0, 180)
-        All are nan where the disc touches or crosses the camera's horizon: its image is no ellipse.
+    centre : ndarray of shape (N, 2)
+        Centres of the ellipses, px.
+    major, minor : ndarray of shape (N,)
+        Semi-axes, px.
+    angle_deg : ndarray of shape (N,)
+        Angles of the major axes from +x towards +y, in [0, 180).
+
+    Notes
+    -----
+    All four are nan where the disc touches or crosses the camera's horizon. Its image is then no ellipse.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.geometry import project_discs
+    >>> H = np.array([[20.0, 0.0, 100.0], [0.0, 10.0, 50.0], [0.0, 0.0, 1.0]])
+    >>> centre, major, minor, angle_deg = project_discs(H[None])
+    >>> centre.tolist(), major.tolist(), minor.tolist(), angle_deg.tolist()
+    ([[100.0, 50.0]], [20.0], [10.0], [0.0])
     """
     dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -78,12 +107,12 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
 
 
 def project_disc(H_patch2image: Float) -> Ellipse:
-    """Image of the unit circle under one homography, see :func:`project_discs`.
+    """Return the ellipse that the unit circle becomes under one homography, see :func:`project_discs`.
 
     Raises
     ------
     ValueError
-        If the disc touches or crosses the camera's horizon, so that its image is no ellipse.
+        If the disc touches or crosses the camera's horizon. Its image is then no ellipse.
     """
     centre, major, minor, angle_deg = project_discs(H_patch2image[None])
     if np.isnan(major[0]):

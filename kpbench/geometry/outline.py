@@ -1,8 +1,11 @@
-"""Outlines made of exact straight lines and circular arcs, in any planar frame.
+"""Outlines of exact straight lines and circular arcs, in any planar frame.
 
-A *contour* is a closed tuple of segments, each of which starts where the one before it ends. A
-*region* is a tuple of contours; the area inside has winding number 1, holes run the other way round.
-An outline never knows where it will be drawn.
+* A *segment* is a :class:`Line` or an :class:`Arc`.
+* A *contour* is a closed tuple of segments. Each segment starts where the segment before it ends.
+* A *region* is a tuple of contours. Points of the region have winding number 1. The contours of holes therefore run in
+  the direction opposite to the outer contours.
+
+Outlines do not depend on the format in which they will be drawn.
 """
 
 from __future__ import annotations
@@ -17,7 +20,15 @@ from kpbench.types import Float
 
 @dataclass(frozen=True)
 class Line:
-    """A straight segment from (x0, y0) to (x1, y1)."""
+    """A straight segment from (x0, y0) to (x1, y1).
+
+    Examples
+    --------
+    >>> from kpbench.geometry import Line, flatten
+    >>> triangle = ((Line(0, 0, 4, 0), Line(4, 0, 0, 3), Line(0, 3, 0, 0)),)
+    >>> flatten(triangle, tolerance=0.1)[0].tolist()
+    [[0, 0], [4, 0], [0, 3]]
+    """
 
     x0: float
     y0: float
@@ -27,7 +38,24 @@ class Line:
 
 @dataclass(frozen=True)
 class Arc:
-    """A circular arc about (x, y); ``sweep_deg`` is positive from +x towards +y, at most ±360."""
+    """A circular arc about (x, y).
+
+    Attributes
+    ----------
+    x, y : float
+        Centre of the circle.
+    radius : float
+    start_deg : float
+        Direction of the first point, from +x towards +y.
+    sweep_deg : float
+        Angle that the arc covers, positive from +x towards +y, from -360 to 360.
+
+    Examples
+    --------
+    >>> from kpbench.geometry import Arc
+    >>> Arc(x=0.0, y=0.0, radius=2.0, start_deg=0.0, sweep_deg=90.0).point(1.0)
+    (0.0, 2.0)
+    """
 
     x: float
     y: float
@@ -36,7 +64,7 @@ class Arc:
     sweep_deg: float
 
     def point(self, fraction: float) -> tuple[float, float]:
-        """The point at a fraction of the sweep, 0 the start and 1 the end; exact at quarter turns."""
+        """Return the point at a fraction of the sweep, from 0 to 1. Points at multiples of 90 degrees are exact."""
         c, s = cos_sin_deg(self.start_deg + fraction * self.sweep_deg)
         return self.x + self.radius * c, self.y + self.radius * s
 
@@ -46,26 +74,68 @@ Region = tuple[Contour, ...]
 
 
 def cos_sin_deg(angle_deg: float) -> tuple[float, float]:
-    """Cosine and sine of an angle in degrees, exact at multiples of 90."""
+    """Return the cosine and sine of an angle. Both are exact at multiples of 90 degrees."""
     quarter, rest = divmod(angle_deg, 90.0)
     c, s = np.cos(np.radians(rest)), np.sin(np.radians(rest))
-    turned = ((c, s), (-s, c), (-c, -s), (s, -c))[int(quarter) % 4]
-    return float(turned[0]), float(turned[1])
+    cosine, sine = ((c, s), (-s, c), (-c, -s), (s, -c))[int(quarter) % 4]
+    return float(cosine), float(sine)
 
 
 def circle(x: float, y: float, radius: float) -> Region:
-    """A full disc."""
+    """Return a full disc as a region.
+
+    Parameters
+    ----------
+    x, y : float
+        Centre.
+    radius : float
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> circle(1.0, 2.0, 3.0)
+    ((Arc(x=1.0, y=2.0, radius=3.0, start_deg=0.0, sweep_deg=360.0),),)
+    """
     return ((Arc(x, y, radius, 0.0, 360.0),),)
 
 
 def rectangle(x: float, y: float, width: float, height: float) -> Region:
-    """An axis-parallel rectangle with its corner of least coordinates at (x, y)."""
+    """Return an axis-parallel rectangle as a region.
+
+    Parameters
+    ----------
+    x, y : float
+        Corner with the least coordinates.
+    width, height : float
+
+    Examples
+    --------
+    >>> from kpbench.geometry import flatten, rectangle
+    >>> flatten(rectangle(0, 0, 4, 3), tolerance=0.1)[0].tolist()
+    [[0, 0], [4, 0], [4, 3], [0, 3]]
+    """
     x1, y1 = x + width, y + height
     return ((Line(x, y, x1, y), Line(x1, y, x1, y1), Line(x1, y1, x, y1), Line(x, y1, x, y)),)
 
 
 def move(region: Region, x: float, y: float, scale: float = 1.0, rotate_deg: float = 0.0) -> Region:
-    """Scale about the origin, turn (from +x towards +y), then shift by (x, y)."""
+    """Return a region scaled about the origin, then rotated about the origin, then shifted.
+
+    Parameters
+    ----------
+    region : tuple of contours
+    x, y : float
+        Shift.
+    scale : float
+    rotate_deg : float
+        Rotation from +x towards +y.
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle, move
+    >>> move(circle(0.0, 0.0, 1.0), x=10.0, y=20.0, scale=3.0)
+    ((Arc(x=10.0, y=20.0, radius=3.0, start_deg=0.0, sweep_deg=360.0),),)
+    """
     c, s = cos_sin_deg(rotate_deg)
 
     def at(px: float, py: float) -> tuple[float, float]:
@@ -82,25 +152,32 @@ def move(region: Region, x: float, y: float, scale: float = 1.0, rotate_deg: flo
 def flatten(region: Region, tolerance: float) -> list[Float]:
     """Approximate every contour by a closed polygon.
 
-    Arcs become chords whose inner vertices lie so far outside the circle that the polygon's area is
-    that of the arc: the remaining edge error is at most ``tolerance`` and has zero mean.
+    Arcs become chords that enclose the same area as the arc, see :func:`arc_vertices`. The distance between chords and
+    arc is at most ``tolerance``. The mean of the distance along the arc is zero.
 
     Parameters
     ----------
-    region : Region
+    region : tuple of contours
     tolerance : float
-        Largest distance between the arc and the polygon, in the region's own unit.
+        Largest distance between an arc and its chords, in the unit of the region.
 
     Returns
     -------
     list of ndarray of shape (N, 2)
-        One polygon a contour; the last vertex joins the first.
+        One polygon per contour. An edge joins the last vertex to the first vertex.
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle, flatten
+    >>> (polygon,) = flatten(circle(0.0, 0.0, 10.0), tolerance=0.01)
+    >>> polygon.shape
+    (50, 2)
     """
     return [np.concatenate([_vertices(part, tolerance) for part in contour]) for contour in region]
 
 
 def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
-    """Return vertices of chords that enclose the same area as the arc.
+    """Return the vertices of chords that enclose the same area as an arc.
 
     The vertices lie outside the circle by the factor ``sqrt(step / sin(step))``. The triangle between two
     neighbours and the centre then has the area of the sector, ``radius ** 2 * step / 2``.
@@ -123,10 +200,10 @@ def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
 
 
 def _vertices(part: Line | Arc, tolerance: float) -> Float:
-    """Vertices of one segment without its end point, which is the next segment's start."""
+    """Return the vertices of one segment without its last point, with which the next segment starts."""
     if isinstance(part, Line):
         return np.array([[part.x0, part.y0]])
-    # sagitta of a chord over the angle 2h is r(1 - cos h) ~ r h²/2; the area balance halves it
+    # a chord over the angle 2h is up to r (1 - cos h) ~ r h² / 2 off the arc; equal areas halve this distance
     half = np.sqrt(4 * tolerance / part.radius) if tolerance < part.radius else np.pi / 4
     count = max(2, int(np.ceil(abs(np.radians(part.sweep_deg)) / (2 * half))))
     step = np.radians(part.sweep_deg) / count
