@@ -3,8 +3,17 @@
 import pytest
 from hypothesis import settings
 
+from kpbench import SynthConfig, generate
+
 settings.register_profile("kpbench", deadline=None)  # how fast a busy machine is proves nothing
 settings.load_profile("kpbench")
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory):
+    """Six images without deteriorations, in two shards; no test may change it."""
+    config = SynthConfig(6, size_px=(320, 240), shard_size=4, deteriorate="none")
+    return generate(config, tmp_path_factory.mktemp("made") / "set", workers=1).dataset
 
 
 @pytest.fixture

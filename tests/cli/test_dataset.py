@@ -7,21 +7,13 @@ import pytest
 from helpers import kpbench
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made") / "set"
-    result = kpbench("synth", "--n", 6, "--size", "160x120", "--out", folder, "--workers", 1)
-    assert "6 images, 1 shards, fingerprint" in result.stdout
-    return folder
-
-
 def test_inspect_verify_and_preview(dataset, tmp_path):
-    told = kpbench("inspect", dataset)
-    assert "6 of 160x120, grey" in told.stdout
-    checked = kpbench("verify", dataset)
+    told = kpbench("inspect", dataset.path)
+    assert "6 of 320x240, grey" in told.stdout
+    checked = kpbench("verify", dataset.path)
     assert "all as written" in checked.stdout
     sheet = tmp_path / "sheet.png"
-    kpbench("preview", dataset, "--out", sheet, "--count", 4, "--columns", 2, "--tile-width", 160)
+    kpbench("preview", dataset.path, "--out", sheet, "--count", 4, "--columns", 2, "--tile-width", 160)
     assert cv2.imread(str(sheet)).shape == (2 * 124 + 4, 2 * 164 + 4, 3)
 
 
@@ -48,7 +40,9 @@ def test_designs_of_ones_own(tmp_path):
     design = 'name = "half"\nid = 7\nsemicircles = [{ start_deg = 90, ink = "black" }]\n'
     (tmp_path / "half.toml").write_text(design)
     for given in (tmp_path, tmp_path / "half.toml"):
-        kpbench("synth", "--n", 4, "--size", "160x120", "--patches", given, "--out", tmp_path / "set", "--overwrite")
+        made = ("synth", "--n", 4, "--size", "160x120", "--patches", given, "--out", tmp_path / "set", "--overwrite")
+        result = kpbench(*made)
+        assert "4 images, 1 shards, fingerprint" in result.stdout
         told = kpbench("inspect", tmp_path / "set").stdout
         ids = told.partition("patch ID\n")[2].partition("radius")[0].split("\n")
         assert [line.split()[0] for line in ids if line] == ["7"]
@@ -58,10 +52,10 @@ def test_designs_of_ones_own(tmp_path):
 
 
 def test_a_second_synth_into_the_folder_changes_nothing(dataset):
-    before = (dataset / "dataset.json").read_bytes()
-    result = kpbench("synth", "--n", 7, "--out", dataset, code=1)
+    before = (dataset.path / "dataset.json").read_bytes()
+    result = kpbench("synth", "--n", 7, "--out", dataset.path, code=1)
     assert "already holds a dataset; add --resume" in result.stderr
-    assert (dataset / "dataset.json").read_bytes() == before
+    assert (dataset.path / "dataset.json").read_bytes() == before
 
 
 @pytest.mark.parametrize(
@@ -95,7 +89,7 @@ def test_numbers_that_are_none_are_wrong_usage(arguments):
 
 def test_a_full_standard_output_is_one_line(dataset):
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "kpbench", "verify", str(dataset)]
+        command = [sys.executable, "-m", "kpbench", "verify", str(dataset.path)]
         buffered = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=buffered)
     assert done.returncode == 1

@@ -1,16 +1,9 @@
 import numpy as np
-import pytest
 
 from kpbench.dataset.card import facts, histograms, write_card
 from kpbench.dataset.generation import generate
 from kpbench.render.scene import Limits
 from kpbench.synth.synthetic import SynthConfig
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    config = SynthConfig(6, size_px=(320, 240), deteriorate="none")
-    return generate(config, tmp_path_factory.mktemp("made") / "set", workers=1).dataset
 
 
 def test_every_keypoint_is_in_every_histogram(dataset):

@@ -8,15 +8,7 @@ import pytest
 
 from kpbench.dataset import export as interchange
 from kpbench.dataset.export import export_dataset
-from kpbench.dataset.generation import generate
 from kpbench.errors import DataError
-from kpbench.synth.synthetic import SynthConfig
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    config = SynthConfig(6, size_px=(320, 240), shard_size=4, deteriorate="none")
-    return generate(config, tmp_path_factory.mktemp("made") / "set", workers=1).dataset
 
 
 def test_pycocotools_reads_the_coco_export_and_finds_our_keypoints(dataset, tmp_path):
