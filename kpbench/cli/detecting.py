@@ -64,9 +64,9 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
     from kpbench.images import refuse_same_folder
-    from kpbench.predictions.files import check_target, write_predictions
+    from kpbench.predictions.files import require_predictions_path, write_predictions
 
-    check_target(out)
+    require_predictions_path(out)
     if overlay is not None:
         refuse_same_folder(source, overlay)
     detector = _told(name, patches, threshold) if patches else name

@@ -15,17 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
-from kpbench.predictions.decode import cut, kind, parse, records, typed, without_gc
-from kpbench.predictions.table_files import from_table
+from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
+from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
-Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]  # a patch ID plus 1
+Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]
+"""Number of a category: a patch ID plus 1."""
 Point = tuple[float, float, float]
+"""Place x, y in px, and COCO's visibility v; v = 0 is "not labelled"."""
 
 
-class Image(msgspec.Struct, gc=False):
-    """An entry of ``images``."""
+class CocoImage(msgspec.Struct, gc=False):
+    """An entry of ``images``. Condition, rung and scene are kpbench's additions."""
 
     id: Whole
     file_name: str = ""
@@ -34,8 +36,8 @@ class Image(msgspec.Struct, gc=False):
     scene_id: Whole | None = None
 
 
-class Annotation(msgspec.Struct, gc=False):
-    """An entry of ``annotations``: one keypoint with the radius of its disc."""
+class CocoAnnotation(msgspec.Struct, gc=False):
+    """An entry of ``annotations``: a keypoint with the radius of its disc. The radii are kpbench's additions."""
 
     image_id: Whole
     category_id: Category
@@ -47,22 +49,22 @@ class Annotation(msgspec.Struct, gc=False):
     visible: float = 1.0
 
 
-class Info(msgspec.Struct):
-    """What the export of kpbench says of the dataset."""
+class CocoInfo(msgspec.Struct):
+    """The ``info`` object. The fingerprint is kpbench's addition."""
 
     fingerprint: str = ""
 
 
-class Annotations(msgspec.Struct):
+class CocoAnnotations(msgspec.Struct):
     """A COCO annotations file."""
 
-    images: list[Image]
-    annotations: list[Annotation]
-    info: Info = msgspec.field(default_factory=Info)
+    images: list[CocoImage]
+    annotations: list[CocoAnnotation]
+    info: CocoInfo = msgspec.field(default_factory=CocoInfo)
 
 
-class Result(msgspec.Struct, gc=False):
-    """An entry of a results file: one detection."""
+class CocoResult(msgspec.Struct, gc=False):
+    """An entry of a results file: a detection."""
 
     image_id: Whole
     category_id: Category
@@ -70,7 +72,7 @@ class Result(msgspec.Struct, gc=False):
     score: float
 
 
-EXPECTED = {
+EXPECTED_IN_COCO = {
     "axis_angle": "degrees",
     "category_id": "a whole number from 1",
     "condition": "a text",
@@ -86,20 +88,29 @@ EXPECTED = {
     "score": "a finite number",
     "visible": "a fraction",
 }
+"""What each field of the records above must hold, in words."""
 
 
 @dataclass(frozen=True)
 class CocoDataset:
-    """What the evaluator and the report need of a dataset, from COCO annotations.
+    """A dataset of COCO annotations, for scoring and reports; opened by :func:`kpbench.predictions.open_coco`.
 
     Attributes
     ----------
     path : Path
         The annotations file.
     truth : Truth
-        With the fingerprint of the dataset that was exported, else the SHA-256 of the annotations file.
     files : tuple of str
-        Names of the images, below the folder of the annotations file or its ``images`` folder; may be missing.
+        File names of the images, relative to the folder of the annotations file or to its ``images`` folder. The
+        files may be missing.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> folder = kpbench.export_dataset(kpbench.open_dataset("kpbench-data"), "coco", "coco")
+    >>> dataset = kpbench.predictions.open_coco("coco/annotations.json")
+    >>> len(dataset.truth), len(dataset.files)
+    (6, 6)
     """
 
     path: Path
@@ -108,21 +119,21 @@ class CocoDataset:
 
     @property
     def fingerprint(self) -> str:
-        """Of the dataset that ``kpbench export`` wrote, else the SHA-256 of the annotations file."""
+        """Fingerprint of the dataset that was exported; without one the SHA-256 of the annotations file."""
         return self.truth.fingerprint
 
     @property
     def config(self) -> dict[str, Any]:
-        """Empty: nothing is known of how the images were made."""
+        """Empty: annotations do not tell how the images were made."""
         return {}
 
     def image(self, index: int) -> UInt8:
-        """The image at a position, (H, W, 3) uint8 RGB.
+        """Read the image at a position, uint8 of shape (H, W, 3), RGB.
 
         Raises
         ------
         DataError
-            If there is none, or it cannot be decoded.
+            If the image is missing or cannot be decoded.
         """
         import cv2
 
@@ -136,23 +147,41 @@ class CocoDataset:
 def open_coco(path: str | Path) -> CocoDataset:
     """Read true keypoints from a COCO annotations file.
 
-    Every annotation has one keypoint ``[x, y, v]`` (with v = 0 it is passed over) and its radius in px: ``radius``, or
-    ``radius_major`` and ``radius_minor``. Its patch ID is ``category_id`` less 1, as ``kpbench export --format coco``
-    numbers them. Images may have a ``condition`` (text), a ``rung`` (number) and a ``scene_id`` (whole number).
+    Each annotation has one keypoint ``[x, y, v]`` and its radius in px: ``radius``, or ``radius_major`` and
+    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` less 1, as ``kpbench export
+    --format coco`` numbers the categories. Images may have a ``condition`` (text), a ``rung`` (number) and a
+    ``scene_id`` (whole number).
+
+    Parameters
+    ----------
+    path : str or Path
+
+    Returns
+    -------
+    CocoDataset
 
     Raises
     ------
     DataError
-        One line with the file, the entry in it and what was expected.
+        If the file cannot be read. One line names the file, the entry in it and what was expected.
+
+    Examples
+    --------
+    >>> import json, pathlib, kpbench
+    >>> annotation = {"image_id": 1, "category_id": 1, "keypoints": [10, 20, 2], "radius": 5}
+    >>> content = {"images": [{"id": 1, "file_name": "1.png"}], "annotations": [annotation]}
+    >>> _ = pathlib.Path("truth.json").write_text(json.dumps(content))
+    >>> kpbench.predictions.open_coco("truth.json").truth.keypoints["radius_major"].tolist()
+    [5.0]
     """
     path = Path(path)
     try:
         data = path.read_bytes()
-        with without_gc():
-            content = _annotations(data)
-            truth = _truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
+        with pause_gc():
+            content = _decode_annotations(data)
+            truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
             files = tuple(image.file_name for image in content.images)
-            del content  # else the collector would walk through it
+            del content  # freed before the collector would walk through it
         return CocoDataset(path, truth, files)
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {error.strerror}") from None
@@ -160,44 +189,45 @@ def open_coco(path: str | Path) -> CocoDataset:
         raise DataError(f"{path}: {error}") from None
 
 
-def _annotations(data: bytes) -> Annotations:
+def _decode_annotations(data: bytes) -> CocoAnnotations:
     try:
-        return msgspec.json.decode(data, type=Annotations)
+        return msgspec.json.decode(data, type=CocoAnnotations)
     except (ValueError, RecursionError):
-        content = parse(data, "the file")
+        content = parse_json(data, "the file")  # a second time, to find the place of the fault
     if not isinstance(content, dict):
-        raise DataError(f"holds {kind(content)}, expected COCO annotations") from None
+        raise DataError(f"holds {json_type(content)}, expected COCO annotations") from None
     for name in ("images", "annotations"):
         if not isinstance(content.get(name), list):
             raise DataError(f"has no list {name!r}, expected COCO annotations") from None
     info = content.get("info")
-    named = info.get("fingerprint") if isinstance(info, dict) else None
-    return Annotations(
-        typed(content["images"], Image, EXPECTED, lambda n: f"images[{n}]"),
-        typed(content["annotations"], Annotation, EXPECTED, lambda n: f"annotations[{n}]"),
-        Info(named if isinstance(named, str) else ""),
+    fingerprint = info.get("fingerprint") if isinstance(info, dict) else None
+    return CocoAnnotations(
+        convert_records(content["images"], CocoImage, EXPECTED_IN_COCO, lambda n: f"images[{n}]"),
+        convert_records(content["annotations"], CocoAnnotation, EXPECTED_IN_COCO, lambda n: f"annotations[{n}]"),
+        CocoInfo(fingerprint if isinstance(fingerprint, str) else ""),
     )
 
 
-def _truth(content: Annotations, fingerprint: str) -> Truth:
+def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
     images, annotations = content.images, content.annotations
     ids = np.array([image.id for image in images], np.int64)
     sorter = np.argsort(ids, kind="stable")
     if np.any(np.diff(ids[sorter]) == 0):
         raise DataError("two images share an id")
-    named = _column(annotations, "image_id", np.int64)
-    keypoints, labelled = _keypoints(annotations)
-    place = np.searchsorted(ids, named, sorter=sorter)
-    unknown = np.append(ids[sorter], -1)[place] != named
+    image_id = _column(annotations, "image_id", np.int64)
+    keypoints, labelled = _make_keypoints(annotations)
+    place = np.searchsorted(ids, image_id, sorter=sorter)
+    unknown = np.append(ids[sorter], -1)[place] != image_id
     if unknown.any():
         n = int(np.argmax(unknown))
-        raise DataError(f"annotations[{n}]: image_id is {named[n]}, but there is no such image")
+        raise DataError(f"annotations[{n}]: image_id is {image_id[n]}, but there is no such image")
     image = sorter[place[labelled]]
     rows = np.flatnonzero(labelled)[np.argsort(image, kind="stable")]
+    is_in_order = np.array_equal(rows, np.arange(len(keypoints)))
     return Truth(
         image_id=ids,
         offsets=offsets_of(np.bincount(image, minlength=len(ids))),
-        keypoints=keypoints if np.array_equal(rows, np.arange(len(keypoints))) else keypoints[rows],
+        keypoints=keypoints if is_in_order else keypoints[rows],
         condition=np.array([image.condition for image in images], np.str_),
         rung=np.array([np.nan if image.rung is None else image.rung for image in images]),
         scene_id=np.array([image.id if image.scene_id is None else image.scene_id for image in images], np.int64),
@@ -205,8 +235,8 @@ def _truth(content: Annotations, fingerprint: str) -> Truth:
     )
 
 
-def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """The table of all annotations, and which of them are labelled."""
+def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """Return the keypoints of all annotations, of type KEYPOINT_DTYPE, and whether each is labelled (v over 0)."""
     table = np.zeros(len(annotations), KEYPOINT_DTYPE)
     points = _points(annotations)
     table["x"], table["y"] = points[:, 0], points[:, 1]
@@ -222,9 +252,9 @@ def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.
                 "expected the disc's in px as radius, or radius_major and radius_minor"
             )
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
-    fine = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
-    if not fine.all():
-        n = int(np.argmin(fine))
+    valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
+    if not valid.all():
+        n = int(np.argmin(valid))
         raise DataError(
             f"annotations[{n}] (image_id {annotations[n].image_id}): keypoints are {points[n].tolist()} and the radius "
             f"is {table['radius_major'][n]}, expected finite numbers"
@@ -232,52 +262,52 @@ def _keypoints(annotations: list[Annotation]) -> tuple[NDArray[Any], NDArray[np.
     return table, points[:, 2] > 0
 
 
-def _column(entries: Sequence[Annotation | Result], name: str, kind: type = np.float64) -> NDArray[Any]:
-    """One field of all entries; nan where there is none."""
+def _column(entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: type = np.float64) -> NDArray[Any]:
+    """Return a field of all entries; nan for None."""
     values = map(attrgetter(name), entries)
     try:
         return np.fromiter(values, kind, len(entries))
-    except TypeError:  # None among them
+    except TypeError:  # some value is None
         return np.array([getattr(entry, name) for entry in entries], kind)
 
 
-def _points(entries: Sequence[Annotation | Result]) -> NDArray[np.float64]:
-    """Rows x, y, v."""
+def _points(entries: Sequence[CocoAnnotation | CocoResult]) -> NDArray[np.float64]:
+    """Return rows x, y, v."""
     points = chain.from_iterable(map(attrgetter("keypoints"), entries))
     return np.fromiter(points, np.float64, 3 * len(entries)).reshape(-1, 3)
 
 
-def coco_results(data: bytes) -> Predictions:
-    """COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``, as predictions.
+def decode_coco_results(data: bytes) -> Predictions:
+    """Decode COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``.
 
-    Each entry is one detection with one keypoint, whose visibility v is ignored; its patch ID is the category ID less
-    1, as ``kpbench export --format coco`` numbers them. Images without detections are not listed in such a file.
+    Each entry is a detection with one keypoint, whose visibility v is ignored. Its patch ID is the category ID less 1,
+    as ``kpbench export --format coco`` numbers the categories. Results cannot name images without detections.
 
     Raises
     ------
     PredictionsError
-        Naming the first entry that does not fit, and its image.
+        At the first entry with a fault; the message names its image.
     """
 
     def place(n: int) -> str:
         return f"results[{n}]"
 
     try:
-        frame, pieces = cut(data, r"^\s*\[")
+        frame, pieces = split_list(data, r"^\s*\[")
         if frame != []:
             raise ValueError
-        parts = [_detections(batch) for batch in records(pieces, Result, EXPECTED, place)]
-    except (ValueError, RecursionError):  # entries may hold objects: read it whole, which also says what is wrong
-        entries = parse(data, "the file")
+        parts = [_to_columns(batch) for batch in decode_records(pieces, CocoResult, EXPECTED_IN_COCO, place)]
+    except (ValueError, RecursionError):  # entries may hold objects: decode at once, which finds a fault's place too
+        entries = parse_json(data, "the file")
         if not isinstance(entries, list):
-            raise PredictionsError(f"holds {kind(entries)}, expected a list of COCO keypoint results") from None
-        parts = [_detections(typed(entries, Result, EXPECTED, place))]
-    columns = map(np.concatenate, zip(_detections([]), *parts, strict=True))
-    return from_table(dict(zip(("image_id", "id", "score", "x", "y"), columns, strict=True)), {}, place)
+            raise PredictionsError(f"holds {json_type(entries)}, expected a list of COCO keypoint results") from None
+        parts = [_to_columns(convert_records(entries, CocoResult, EXPECTED_IN_COCO, place))]
+    columns = map(np.concatenate, zip(_to_columns([]), *parts, strict=True))
+    return build_predictions(dict(zip(("image_id", "id", "score", "x", "y"), columns, strict=True)), {}, place)
 
 
-def _detections(batch: list[Result]) -> tuple[NDArray[Any], ...]:
-    """Columns ``image_id, id, score, x, y`` of some results."""
+def _to_columns(batch: list[CocoResult]) -> tuple[NDArray[Any], ...]:
+    """Return the columns ``image_id, id, score, x, y`` of some results."""
     points = _points(batch)
     return (
         _column(batch, "image_id", np.int64),

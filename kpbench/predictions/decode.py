@@ -1,7 +1,7 @@
-"""JSON straight into typed records, a piece of a long list at a time, and what is wrong in it in one line.
+"""Decode JSON into typed records, a part of a long list at a time, and describe the first fault in one line.
 
-Typed decoding passes over what is not asked for and makes no dictionaries. Only a file that it refuses is read again
-loosely, to say where the fault is.
+Decoding into typed records skips unknown fields and makes no dictionaries. Only a file with a fault is decoded a second
+time, into plain objects, to find the place of the fault.
 """
 
 from __future__ import annotations
@@ -17,36 +17,39 @@ import msgspec
 
 from kpbench.errors import PredictionsError
 
-PIECE_BYTES = 4 * 2**20  # of JSON that is decoded at a time
+PIECE_BYTES = 4 * 2**20
+"""Bytes of JSON that are decoded at a time."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
-Expected = Mapping[str, str]  # what each field, and where it is a list (its name and []) each entry, holds, in words
-Place = Callable[[int], str]  # what the n-th entry is called
+Expected = Mapping[str, str]
+"""What each field of a record must hold, in words. ``NAME[]`` describes the entries of a list."""
+Place = Callable[[int], str]
+"""A function that names the n-th record of a file, such as ``predictions[12]``."""
 
 
-def cut(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
-    """The rest of a large JSON text, and the list in it, which ends with the last ``]``, cut into shorter lists.
+def split_list(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
+    """Split the long list of a JSON text into shorter lists.
 
-    Decoded at once, the list would take several times its text in memory. No record holds an object, so each ends
-    with the next brace; and lists that decode one by one are the list that they were cut from.
+    Decoded at once, the list would take several times the memory of its text. The split is at closing braces, so the
+    records of the list must not contain objects. The list must be the last one of the text.
 
     Parameters
     ----------
     data : bytes
     opening : str
-        A regular expression for what comes before the list, its bracket included.
+        Regular expression for the text before the list, with the opening bracket of the list.
 
     Returns
     -------
     frame : decoded JSON
-        All but the entries of the list.
+        The text with an empty list in place of the long one.
     pieces : iterator of bytes
-        Lists; ValueError where one cannot be cut off.
+        The shorter lists, as JSON. It raises ValueError where the list cannot be split.
 
     Raises
     ------
     ValueError
-        If the text is none that can be cut like this.
+        If the text does not begin like this, or the frame is not JSON.
     """
     found = re.search(opening.encode(), data)
     start, stop = (found.end(), data.rfind(b"]")) if found else (0, 0)
@@ -68,65 +71,78 @@ def cut(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
     return frame, pieces()
 
 
-def records(pieces: Iterable[bytes], of: type[Record], expected: Expected, place: Place) -> Iterator[list[Record]]:
-    """The typed records of each piece.
+def decode_records(
+    pieces: Iterable[bytes], record: type[Record], expected: Expected, place: Place
+) -> Iterator[list[Record]]:
+    """Decode the typed records of each piece of a list.
+
+    Parameters
+    ----------
+    pieces : iterable of bytes
+        Lists of records, as JSON.
+    record : type
+    expected : mapping of str to str
+    place : function
+        Names the n-th record of all pieces.
 
     Raises
     ------
     PredictionsError
-        For the first record that does not fit, see :func:`typed`.
+        At the first record with a fault, see :func:`convert_records`.
     ValueError
-        If a piece is no JSON.
+        If a piece is not JSON.
     """
-    decoder = msgspec.json.Decoder(list[of])  # type: ignore[valid-type]
+    decoder = msgspec.json.Decoder(list[record])  # type: ignore[valid-type]
     start = 0
     for piece in pieces:
         try:
             batch: list[Record] = decoder.decode(piece)
         except (ValueError, RecursionError):
             first = start
-            batch = typed(json.loads(piece), of, expected, lambda n: place(first + n))  # noqa: B023 used at once
+            batch = convert_records(json.loads(piece), record, expected, lambda n: place(first + n))  # noqa: B023
         yield batch
         start += len(batch)
 
 
-def typed(entries: list[Any], of: type[Record], expected: Expected, place: Place) -> list[Record]:
-    """Typed records from decoded JSON; NaN, which Python's own json writes, passes here.
+def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> list[Record]:
+    """Convert decoded JSON to typed records. Values of NaN, which Python's own json writes, are accepted.
 
     Raises
     ------
     PredictionsError
-        Naming the first entry that does not fit, its image, the field, its value and what was expected.
+        At the first record with a fault. The message names the record, its image, the field, the value and what was
+        expected.
     """
     try:
-        return msgspec.convert(entries, list[of])  # type: ignore[valid-type]
+        return msgspec.convert(entries, list[record])  # type: ignore[valid-type]
     except msgspec.ValidationError as error:
         problem, _, path = str(error).rpartition(" - at `$")
     n, *steps = (int(index) if index else name for index, name in re.findall(r"\[(\d+)\]|\.(\w+)", path))
     entry = entries[n]
     if type(entry) is not dict:
-        raise PredictionsError(f"{place(n)} is {kind(entry)}, expected an object")
-    where = f"{place(n)} (image_id {short(entry['image_id'])})" if "image_id" in entry else place(n)
+        raise PredictionsError(f"{place(n)} is {json_type(entry)}, expected an object")
+    where = f"{place(n)} (image_id {abbreviate(entry['image_id'])})" if "image_id" in entry else place(n)
     if not steps:
-        lacking, name = re.findall("(missing|unknown).* field `(.*)`", problem)[0]
-        if lacking == "missing":
+        fault, name = re.findall("(missing|unknown).* field `(.*)`", problem)[0]
+        if fault == "missing":
             raise PredictionsError(f"{where}: no {name}, expected {expected[name]}")
         raise PredictionsError(
             f"{where}: unknown key {name!r}, expected {', '.join(k for k in expected if k[-1] != ']')}"
         )
     name, index = str(steps[0]), steps[1:2]
     if index and f"{name}[]" in expected:
-        value, what = entry[name][index[0]], expected[f"{name}[]"]
-        raise PredictionsError(f"{where}: {name}[{index[0]}] is {short(value)}, expected {what}")
-    raise PredictionsError(f"{where}: {name} is {short(entry[name])}, expected {expected[name]}")
+        value = abbreviate(entry[name][index[0]])
+        raise PredictionsError(f"{where}: {name}[{index[0]}] is {value}, expected {expected[f'{name}[]']}")
+    raise PredictionsError(f"{where}: {name} is {abbreviate(entry[name])}, expected {expected[name]}")
 
 
-def parse(data: bytes, place: str) -> Any:
-    """Decode JSON, and what Python's json.dump writes for NaN too.
+def parse_json(data: bytes, place: str) -> Any:
+    """Decode JSON into plain objects. Values of NaN, which Python's own json writes, are accepted.
 
     Raises
     ------
     PredictionsError
+        If the data is not JSON; the message begins with ``place``.
     """
     try:
         return msgspec.json.decode(data)
@@ -138,21 +154,21 @@ def parse(data: bytes, place: str) -> Any:
         raise PredictionsError(f"{place} is cut off or no JSON ({problem})") from None
 
 
-def kind(value: object) -> str:
-    """What JSON calls the type of a value."""
+def json_type(value: object) -> str:
+    """Name the JSON type of a decoded value, with its article."""
     names = {dict: "an object", list: "a list", str: "a text", bool: "a truth value", type(None): "missing or null"}
     return names.get(type(value), "a number")
 
 
-def short(value: object) -> str:
-    """At most 60 characters of a value."""
+def abbreviate(value: object) -> str:
+    """Write a value with at most 60 characters."""
     text = repr(value)
     return text if len(text) <= 60 else text[:57] + "..."
 
 
 @contextmanager
-def without_gc() -> Iterator[None]:
-    """Pause the garbage collector, which would walk through millions of new objects again and again."""
+def pause_gc() -> Iterator[None]:
+    """Pause the garbage collector. It would walk through millions of new objects many times."""
     running = gc.isenabled()
     gc.disable()
     try:

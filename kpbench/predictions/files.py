@@ -1,8 +1,8 @@
-"""Predictions files: what a detector found in every image of a dataset, in and out.
+"""Read and write predictions files: the detections of a detector in every image of a dataset.
 
-In memory the predictions are columns (:class:`kpbench.types.Predictions`), so that a million images are a handful
-of arrays. On disk they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or
-``.h5``, all with the same content; ``docs/reference/predictions-format.md`` describes each.
+In memory the predictions are columns (:class:`kpbench.Predictions`), so that a million images are a few arrays. On disk
+they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``, all with the same
+content. ``docs/reference/predictions-format.md`` describes each format.
 """
 
 from __future__ import annotations
@@ -12,83 +12,121 @@ from pathlib import Path
 
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import write_atomic
-from kpbench.predictions import json_files as records
-from kpbench.predictions import table_files as columns
-from kpbench.predictions.decode import without_gc
+from kpbench.predictions import json_files, table_files
+from kpbench.predictions.decode import pause_gc
 from kpbench.types import Predictions
 
 READERS: dict[str, Callable[[Path], Predictions]] = {
-    ".json": records.read_json,
-    ".jsonl": records.read_jsonl,
-    ".csv": columns.read_csv,
-    ".parquet": columns.read_parquet,
-    ".h5": columns.read_h5,
+    ".json": json_files.read_json,
+    ".jsonl": json_files.read_jsonl,
+    ".csv": table_files.read_csv,
+    ".parquet": table_files.read_parquet,
+    ".h5": table_files.read_h5,
 }
-WRITERS: dict[str, Callable[[Predictions], bytes]] = {
-    ".json": records.write_json,
-    ".jsonl": records.write_jsonl,
-    ".csv": columns.write_csv,
-    ".parquet": columns.write_parquet,
-    ".h5": columns.write_h5,
+"""The function that reads a format, by the suffix of its files."""
+ENCODERS: dict[str, Callable[[Predictions], bytes]] = {
+    ".json": json_files.encode_json,
+    ".jsonl": json_files.encode_jsonl,
+    ".csv": table_files.encode_csv,
+    ".parquet": table_files.encode_parquet,
+    ".h5": table_files.encode_h5,
 }
+"""The function that encodes a format, by the suffix of its files."""
 
 
 def read_predictions(path: str | Path) -> Predictions:
-    """Read a predictions file; its suffix tells the format.
+    """Read a predictions file. Its suffix selects the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ending in .json, .jsonl, .csv, .parquet or .h5.
+
+    Returns
+    -------
+    Predictions
 
     Raises
     ------
     PredictionsError
-        One line with the file, the place in it and what was expected.
+        If the file cannot be read. One line names the file, the place in it and what was expected.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> predictions = kpbench.read_predictions("preds.json")
+    >>> len(predictions), predictions.detector
+    (6, {'name': 'oracle'})
     """
     path = Path(path)
     try:
-        if path.suffix.lower() not in READERS:
-            *some, last = READERS
-            raise PredictionsError(f"unknown kind of predictions file, expected {', '.join(some)} or {last}")
-        with path.open("rb") as file:  # here, so that all formats say the same of a file that is not there
+        suffix = _require_known_suffix(path)
+        with path.open("rb") as file:  # opened here, so that all formats have one message for a missing file
             if not file.read(1):
                 raise PredictionsError("the file is empty")
-        with without_gc():
-            return READERS[path.suffix.lower()](path)
+        with pause_gc():
+            return READERS[suffix](path)
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
     except OSError as error:
         raise PredictionsError(f"{path}: cannot be read, {error.strerror or error}") from None
 
 
-def check_target(path: str | Path) -> Path:
-    """A path that predictions can be written to, by its suffix and folder; what else may fail shows when it is done.
+def require_predictions_path(path: str | Path) -> Path:
+    """Refuse a path that no predictions can be written to, before the work is done.
 
     Raises
     ------
     PredictionsError
-        If the suffix is unknown.
+        If the suffix is that of no format.
     DataError
-        If the folder is not there.
+        If the folder does not exist.
     """
     path = Path(path)
-    if path.suffix.lower() not in WRITERS:
-        *some, last = WRITERS
-        raise PredictionsError(f"{path}: unknown kind of predictions file, expected {', '.join(some)} or {last}")
+    try:
+        _require_known_suffix(path)
+    except PredictionsError as error:
+        raise PredictionsError(f"{path}: {error}") from None
     if not path.parent.is_dir():
         raise DataError(f"{path}: cannot be written, there is no folder {path.parent}")
     return path
 
 
+def _require_known_suffix(path: Path) -> str:
+    suffix = path.suffix.lower()
+    if suffix not in READERS:
+        *some, last = READERS
+        raise PredictionsError(f"unknown kind of predictions file, expected {', '.join(some)} or {last}")
+    return suffix
+
+
 def write_predictions(path: str | Path, predictions: Predictions) -> None:
-    """Write a predictions file, whole or not at all; its suffix tells the format.
+    """Write a predictions file, whole or not at all. Its suffix selects the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ending in .json, .jsonl, .csv, .parquet or .h5.
+    predictions : Predictions
 
     Raises
     ------
     PredictionsError
-        If the suffix is unknown or pyarrow is needed and missing.
+        If the suffix is unknown, or if the format needs pyarrow and pyarrow is not installed.
     DataError
         If the disk is full or the folder cannot be written.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> found = [kpbench.Detections([[100.25, 80.5]], [0.98], [0]), kpbench.Detections.none()]
+    >>> kpbench.write_predictions("mine.csv", kpbench.Predictions.from_detections(found, image_id=[0, 1]))
+    >>> kpbench.read_predictions("mine.csv").xy.tolist()
+    [[100.25, 80.5]]
     """
-    path = check_target(path)
+    path = require_predictions_path(path)
     try:
-        data = WRITERS[path.suffix.lower()](predictions)
+        data = ENCODERS[path.suffix.lower()](predictions)
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
     write_atomic(path, data)

@@ -1,19 +1,26 @@
-"""The header of predictions files, which all formats share."""
+"""The header of predictions files, the same in all formats."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from kpbench.errors import PredictionsError
-from kpbench.predictions.decode import kind
+from kpbench.predictions.decode import json_type
 from kpbench.types import Predictions
 
 SCHEMA = "kpbench.predictions/1"
+"""Name and version of the format of predictions files."""
 HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 
 
-def read_header(content: Any) -> dict[str, Any]:
-    """Check what all formats share; gives the keyword arguments ``detector``, ``dataset``, ``fingerprint``."""
+def parse_header(content: Any) -> dict[str, Any]:
+    """Check a decoded header, and return its ``detector``, ``dataset`` and ``fingerprint``.
+
+    Raises
+    ------
+    PredictionsError
+        At the first key that is unknown, missing or of a wrong type.
+    """
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         found = repr(content["schema"]) if isinstance(content, dict) and "schema" in content else "missing"
         raise PredictionsError(f"schema is {found}, expected {SCHEMA!r}")
@@ -21,16 +28,16 @@ def read_header(content: Any) -> dict[str, Any]:
         raise PredictionsError(f"unknown key {key!r}, expected {', '.join(sorted(HEADER_KEYS))} and predictions")
     detector, dataset = content.get("detector", {}), content.get("dataset")
     if not isinstance(detector, dict):
-        raise PredictionsError(f"detector is {kind(detector)}, expected an object")
+        raise PredictionsError(f"detector is {json_type(detector)}, expected an object")
     if not isinstance(dataset, str | None):
-        raise PredictionsError(f"dataset is {kind(dataset)}, expected a path or a fingerprint")
+        raise PredictionsError(f"dataset is {json_type(dataset)}, expected a path or a fingerprint")
     fingerprint = content.get("fingerprint")
     if not isinstance(fingerprint, str | None):
-        raise PredictionsError(f"fingerprint is {kind(fingerprint)}, expected that of a dataset")
+        raise PredictionsError(f"fingerprint is {json_type(fingerprint)}, expected that of a dataset")
     return {"detector": detector, "dataset": dataset, "fingerprint": fingerprint}
 
 
-def header_of(p: Predictions) -> dict[str, Any]:
-    """What a file says before the predictions."""
-    named = {"dataset": p.dataset, "fingerprint": p.fingerprint}
-    return {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": p.detector}
+def make_header(predictions: Predictions) -> dict[str, Any]:
+    """Return the header of predictions, to be encoded as JSON."""
+    named = {"dataset": predictions.dataset, "fingerprint": predictions.fingerprint}
+    return {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}

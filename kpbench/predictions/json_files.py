@@ -1,8 +1,8 @@
-"""Predictions as JSON and JSON lines: one object an image."""
+"""Predictions as JSON and JSON lines: one object per image."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, NamedTuple
@@ -11,16 +11,24 @@ import msgspec
 import numpy as np
 
 from kpbench.errors import PredictionsError
-from kpbench.predictions.coco import coco_results
-from kpbench.predictions.decode import PIECE_BYTES, cut, kind, parse, records, typed
-from kpbench.predictions.header import SCHEMA, header_of, read_header
+from kpbench.predictions.coco import decode_coco_results
+from kpbench.predictions.decode import (
+    PIECE_BYTES,
+    Place,
+    convert_records,
+    decode_records,
+    json_type,
+    parse_json,
+    split_list,
+)
+from kpbench.predictions.header import SCHEMA, make_header, parse_header
 from kpbench.types import Float, Int, InvalidValue, Predictions, offsets_of
 
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 
-class Record(msgspec.Struct, gc=False, forbid_unknown_fields=True):
-    """One image of a predictions file."""
+class ImageRecord(msgspec.Struct, gc=False, forbid_unknown_fields=True):
+    """The detections in one image."""
 
     image_id: Int64
     keypoints: list[tuple[float, float]]
@@ -28,7 +36,7 @@ class Record(msgspec.Struct, gc=False, forbid_unknown_fields=True):
     ids: list[Int64] | None = None
 
 
-EXPECTED = {
+EXPECTED_IN_RECORD = {
     "ids": "a list",
     "ids[]": "a patch id, 0 or more",
     "image_id": "a whole number of 64 bits",
@@ -37,134 +45,153 @@ EXPECTED = {
     "scores": "a list",
     "scores[]": "a finite number",
 }
+"""What each field of :class:`ImageRecord` must hold, in words."""
 
 
 def read_json(path: Path) -> Predictions:
-    """Read ``.json``: the schema of kpbench, or a list of COCO keypoint results."""
+    """Read a ``.json`` file: kpbench's own schema, or a list of COCO keypoint results.
+
+    Raises
+    ------
+    PredictionsError
+        At the first fault.
+    """
     data = path.read_bytes()
     if data.lstrip()[:1] == b"[":
-        return coco_results(data)
+        return decode_coco_results(data)
 
     def place(n: int) -> str:
         return f"predictions[{n}]"
 
     try:
-        frame, pieces = cut(data, r'"predictions"\s*:\s*\[')
+        frame, pieces = split_list(data, r'"predictions"\s*:\s*\[')
         if isinstance(frame, dict) and frame.pop("predictions", None) == []:
-            return _from_batches(records(pieces, Record, EXPECTED, place), read_header(frame), place)
+            batches = decode_records(pieces, ImageRecord, EXPECTED_IN_RECORD, place)
+            return _combine(batches, parse_header(frame), place)
     except (ValueError, RecursionError):
-        pass  # not of the shape that can be cut: read it whole, which also says what is wrong
-    content = parse(data, "the file")
+        pass  # the list cannot be split: decode the file at once, which finds the place of a fault too
+    content = parse_json(data, "the file")
     if not isinstance(content, dict):
-        raise PredictionsError(f"holds {kind(content)}, expected an object with schema {SCHEMA!r}")
+        raise PredictionsError(f"holds {json_type(content)}, expected an object with schema {SCHEMA!r}")
     entries = content.pop("predictions", None)
-    header = read_header(content)
+    header = parse_header(content)
     if not isinstance(entries, list):
-        raise PredictionsError(f"predictions is {kind(entries)}, expected a list")
-    return _from_batches([typed(entries, Record, EXPECTED, place)], header, place)
+        raise PredictionsError(f"predictions is {json_type(entries)}, expected a list")
+    return _combine([convert_records(entries, ImageRecord, EXPECTED_IN_RECORD, place)], header, place)
 
 
 def read_jsonl(path: Path) -> Predictions:
-    """Read ``.jsonl``: a line with the header, then a record a line."""
-    decoder = msgspec.json.Decoder(Record)
+    """Read a ``.jsonl`` file: a line with the header, then a line per image.
 
-    def record(line: bytes, n: int) -> Record:
+    Raises
+    ------
+    PredictionsError
+        At the first fault.
+    """
+    decoder = msgspec.json.Decoder(ImageRecord)
+
+    def decode_line(line: bytes, n: int) -> ImageRecord:
         try:
             return decoder.decode(line)
         except (ValueError, RecursionError):
-            return typed([parse(line, f"line {n}")], Record, EXPECTED, lambda _: f"line {n}")[0]
+            entry = parse_json(line, f"line {n}")
+            return convert_records([entry], ImageRecord, EXPECTED_IN_RECORD, lambda _: f"line {n}")[0]
 
-    def batches(file: BinaryIO) -> Iterator[list[Record]]:
+    def read_batches(file: BinaryIO) -> Iterator[list[ImageRecord]]:
         first = 2
         while lines := file.readlines(PIECE_BYTES):
-            yield [record(line, n) for n, line in enumerate(lines, first)]
+            yield [decode_line(line, n) for n, line in enumerate(lines, first)]
             first += len(lines)
 
     with path.open("rb") as file:
-        header = read_header(parse(file.readline(), "line 1"))
-        return _from_batches(batches(file), header, lambda n: f"line {n + 2}")
+        header = parse_header(parse_json(file.readline(), "line 1"))
+        return _combine(read_batches(file), header, lambda n: f"line {n + 2}")
 
 
 class _Batch(NamedTuple):
-    """Some records as columns."""
+    """Some records as columns, for N images and K detections."""
 
     image_id: Int
-    counts: Int
+    """(N,)"""
+    keypoint_count: Int
+    """(N,)"""
     xy: Float
+    """(K, 2), px."""
     score: Float
-    scores: Int  # how many an image, -1 where they are left out
+    score_count: Int
+    """(N,); -1 for an image without the list."""
     patch_id: Int
-    ids: Int  # how many an image, -1 where they are left out
+    patch_id_count: Int
+    """(N,); -1 for an image without the list."""
 
 
-def _batch(batch: list[Record]) -> _Batch:
+def _make_batch(records: list[ImageRecord]) -> _Batch:
     def lengths(lists: list[list[Any] | None]) -> Int:
         return np.fromiter([-1 if values is None else len(values) for values in lists], np.int64, len(lists))
 
-    def flat(lists: list[list[Any] | None], dtype: Any) -> Any:
+    def flatten(lists: list[list[Any] | None], dtype: Any) -> Any:
         return np.fromiter(chain.from_iterable(values for values in lists if values), dtype)
 
-    points, scores, ids = ([getattr(r, name) for r in batch] for name in ("keypoints", "scores", "ids"))
+    points, scores, ids = ([getattr(r, name) for r in records] for name in ("keypoints", "scores", "ids"))
     return _Batch(
-        np.fromiter([r.image_id for r in batch], np.int64, len(batch)),
+        np.fromiter([r.image_id for r in records], np.int64, len(records)),
         lengths(points),
         np.fromiter(chain.from_iterable(chain.from_iterable(points)), np.float64).reshape(-1, 2),
-        flat(scores, np.float64),
+        flatten(scores, np.float64),
         lengths(scores),
-        flat(ids, np.int64),
+        flatten(ids, np.int64),
         lengths(ids),
     )
 
 
-def _from_batches(batches: Iterable[list[Record]], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
-    """Columns from records; ``place`` names the n-th of all."""
-    parts = [_batch([]), *map(_batch, batches)]
-    image_id, counts, xy, score, scores, patch_id, ids = map(np.concatenate, zip(*parts, strict=True))
+def _combine(batches: Iterable[list[ImageRecord]], header: dict[str, Any], place: Place) -> Predictions:
+    """Make predictions of all records; ``place`` names the n-th record."""
+    columns = map(np.concatenate, zip(_make_batch([]), *map(_make_batch, batches), strict=True))
+    whole = _Batch(*columns)
 
-    def given(name: str, lengths: Int) -> bool:
-        """Whether a column is there: for every image with keypoints, one value each, or for none."""
-        wrong = np.flatnonzero((lengths >= 0) & (lengths != counts))
-        lacking = np.flatnonzero((lengths < 0) & (counts > 0))
+    def has_values(name: str, counts: Int) -> bool:
+        """Check that a list is given for every image with keypoints or for none; tell whether it is given."""
+        wrong = np.flatnonzero((counts >= 0) & (counts != whole.keypoint_count))
+        lacking = np.flatnonzero((counts < 0) & (whole.keypoint_count > 0))
         if len(wrong):
             n = int(wrong[0])
-            problem = f"{name} has {lengths[n]} values, expected one for each of {counts[n]} keypoints"
-        elif len(lacking) and lengths.max() > 0:
+            problem = f"{name} has {counts[n]} values, expected one for each of {whole.keypoint_count[n]} keypoints"
+        elif len(lacking) and counts.max() > 0:
             n = int(lacking[0])
             problem = f"no {name}, which other images have"
         else:
-            return lengths.max(initial=-1) >= 0 and not len(lacking)
-        raise PredictionsError(f"{place(n)} (image_id {image_id[n]}): {problem}")
+            return counts.max(initial=-1) >= 0 and not len(lacking)
+        raise PredictionsError(f"{place(n)} (image_id {whole.image_id[n]}): {problem}")
 
-    scored, named = given("scores", scores), given("ids", ids)
+    has_scores, has_ids = has_values("scores", whole.score_count), has_values("ids", whole.patch_id_count)
     try:
         return Predictions(
-            image_id=image_id,
-            offsets=offsets_of(counts),
-            xy=xy,
-            score=score if scored else np.ones(len(xy)),
-            patch_id=patch_id if named else None,
+            image_id=whole.image_id,
+            offsets=offsets_of(whole.keypoint_count),
+            xy=whole.xy,
+            score=whole.score if has_scores else np.ones(len(whole.xy)),
+            patch_id=whole.patch_id if has_ids else None,
             **header,
         )
     except InvalidValue as error:
         raise PredictionsError(f"{place(error.image)} (image_id {error.image_id}): {error.problem}") from None
 
 
-def _lines(p: Predictions) -> Iterable[bytes]:
-    """One JSON object an image."""
-    encode = msgspec.json.Encoder().encode
-    for image_id, (a, b) in zip(p.image_id.tolist(), pairwise(p.offsets.tolist()), strict=True):
-        record = {"image_id": image_id, "keypoints": p.xy[a:b].tolist(), "scores": p.score[a:b].tolist()}
-        if p.patch_id is not None:
-            record["ids"] = p.patch_id[a:b].tolist()
-        yield encode(record)
+def _encode_images(predictions: Predictions) -> Iterator[bytes]:
+    """Encode each image as a JSON object in one line."""
+    encode, ids = msgspec.json.Encoder().encode, predictions.patch_id
+    for image_id, (a, b) in zip(predictions.image_id.tolist(), pairwise(predictions.offsets.tolist()), strict=True):
+        xy, scores = predictions.xy[a:b].tolist(), predictions.score[a:b].tolist()
+        record = {"image_id": image_id, "keypoints": xy, "scores": scores}
+        yield encode(record if ids is None else record | {"ids": ids[a:b].tolist()})
 
 
-def write_json(p: Predictions) -> bytes:
-    """The text of a ``.json`` file, a line an image."""
-    head = msgspec.json.encode(header_of(p))[:-1]
-    return b'%s,\n "predictions": [\n  %s\n ]}\n' % (head, b",\n  ".join(_lines(p)))
+def encode_json(predictions: Predictions) -> bytes:
+    """Encode a ``.json`` file, a line per image."""
+    header = msgspec.json.encode(make_header(predictions))[:-1]
+    return b'%s,\n "predictions": [\n  %s\n ]}\n' % (header, b",\n  ".join(_encode_images(predictions)))
 
 
-def write_jsonl(p: Predictions) -> bytes:
-    """The text of a ``.jsonl`` file."""
-    return b"\n".join([msgspec.json.encode(header_of(p)), *_lines(p), b""])
+def encode_jsonl(predictions: Predictions) -> bytes:
+    """Encode a ``.jsonl`` file, a line per image after the header's."""
+    return b"\n".join([msgspec.json.encode(make_header(predictions)), *_encode_images(predictions), b""])

@@ -1,4 +1,4 @@
-"""Predictions as tables: CSV and Parquet with one row a keypoint, HDF5 with one dataset a column."""
+"""Predictions as tables: CSV and Parquet with one row per keypoint, HDF5 with one dataset per column."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import io
 import json
 import math
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,25 +15,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import PredictionsError
-from kpbench.predictions.decode import parse, short
-from kpbench.predictions.header import header_of, read_header
+from kpbench.predictions.decode import Place, abbreviate, parse_json
+from kpbench.predictions.header import make_header, parse_header
 from kpbench.types import Predictions, offsets_of
 
-COLUMNS = ("image_id", "x", "y", "score", "id")
+TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
+"""Columns of CSV and Parquet; score and id are optional."""
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
+"""Datasets of an HDF5 file with their kind: whole (i) or any (f) numbers; score and id are optional."""
+LARGEST_RATIO = 1100
+"""Bytes that one stored byte of HDF5 may stand for. Gzip compresses by at most 1032."""
 
 
-def from_table(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Callable[[int], str]) -> Predictions:
-    """Columns from one row a keypoint, in any order; a row with nothing but an image_id is an image without any."""
-    values = np.stack([table[name].astype(np.float64) for name in COLUMNS[1:] if name in table], axis=1)
+def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Place) -> Predictions:
+    """Make predictions of a table with one row per keypoint, in any order.
+
+    Parameters
+    ----------
+    table : dict of str to ndarray of shape (R,)
+        The columns of :data:`TABLE_COLUMNS`. nan stands for blank. A row with an image_id only is an image without
+        keypoints.
+    header : dict
+        Further fields of the predictions.
+    place : function
+        Names the n-th row.
+
+    Raises
+    ------
+    PredictionsError
+        At the first row with a fault.
+    """
+    values = np.stack([table[name].astype(np.float64) for name in TABLE_COLUMNS[1:] if name in table], axis=1)
     rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-    for name in COLUMNS[1:]:
+    for name in TABLE_COLUMNS[1:]:
         column = table[name][rows] if name in table else np.zeros(0)
-        fine = np.isfinite(column)
+        valid = np.isfinite(column)
         if name == "id":
-            fine &= (column >= 0) & (column == np.floor(column)) & (column < 2**53)
-        if not fine.all():
-            row = int(rows[np.argmin(fine)])
+            valid &= (column >= 0) & (column == np.floor(column)) & (column < 2**53)
+        if not valid.all():
+            row = int(rows[np.argmin(valid)])
             expected = "a patch id, a whole number of 0 or more" if name == "id" else "a finite number"
             value = table[name][row]
             raise PredictionsError(
@@ -56,8 +75,9 @@ def from_table(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Ca
     )
 
 
-def _table(p: Predictions) -> dict[str, NDArray[Any]]:
-    """One row a keypoint, and one blank row for an image without any."""
+def _make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
+    """Return columns with one row per keypoint, and one blank row per image without keypoints."""
+    p = predictions
     counts = np.diff(p.offsets)
     image = np.repeat(np.arange(len(p)), np.maximum(counts, 1))
     blank = counts[image] == 0
@@ -69,11 +89,27 @@ def _table(p: Predictions) -> dict[str, NDArray[Any]]:
     return columns
 
 
+def _check_columns(names: list[str], place: str) -> list[str]:
+    """Return the names of a table's columns without spaces around them, after checking them."""
+    names = [name.strip() for name in names]
+    if not {"image_id", "x", "y"} <= set(names) <= set(TABLE_COLUMNS) or len(set(names)) < len(names):
+        raise PredictionsError(
+            f"{place} has columns {','.join(names)[:80]}, expected {','.join(TABLE_COLUMNS)} (score, id optional)"
+        )
+    return names
+
+
 # --- CSV -----------------------------------------------------------------------------------------------------------
 
 
 def read_csv(path: Path) -> Predictions:
-    """Read ``.csv``: one row a keypoint, and maybe the header behind a ``#`` in the first line."""
+    """Read a ``.csv`` file: one row per keypoint. The first line may be the header, after a ``#``.
+
+    Raises
+    ------
+    PredictionsError
+        At the first fault.
+    """
     import pandas as pd
 
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
@@ -81,19 +117,19 @@ def read_csv(path: Path) -> Predictions:
         header = {}
         skipped = 0
         if first.startswith("#"):
-            header = read_header(parse(first[1:].encode(), "line 1, after #,"))
+            header = parse_header(parse_json(first[1:].encode(), "line 1, after #,"))
             first, skipped = file.readline(), 1
-    names = _columns(next(csv.reader([first]), []), f"line {1 + skipped}")
+    names = _check_columns(next(csv.reader([first]), []), f"line {1 + skipped}")
 
     def place(row: int) -> str:
         return f"line {row + 2 + skipped}"
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pandas 3.1 deprecates float_precision, pandas 2 is inexact without
-            warnings.simplefilter("error", pd.errors.ParserWarning)  # a row that is too long is only a warning
+            warnings.simplefilter("ignore")  # pandas 3.1 deprecates float_precision; pandas 2 is inexact without it
+            warnings.simplefilter("error", pd.errors.ParserWarning)  # pandas only warns of a row that is too long
             table = pd.read_csv(
-                _without_blank_end(path),
+                _strip_blank_lines(path),
                 skiprows=skipped,
                 index_col=False,
                 dtype={name: np.int64 if name == "image_id" else np.float64 for name in names},
@@ -103,32 +139,22 @@ def read_csv(path: Path) -> Predictions:
                 skip_blank_lines=False,
                 encoding="utf-8-sig",
             )
-    except (ValueError, Warning) as error:  # pandas' parser errors are ValueErrors
-        raise _first_bad_row(path, skipped, names, place, error) from None
-    return from_table({name: table[name].to_numpy() for name in names}, header, place)
+    except (ValueError, Warning) as error:  # the errors of pandas' parser are ValueErrors
+        raise _find_bad_row(path, skipped, names, place, error) from None
+    return build_predictions({name: table[name].to_numpy() for name in names}, header, place)
 
 
-def _without_blank_end(path: Path) -> Path | io.BytesIO:
-    """A file, or what it holds where blank lines follow, which editors leave."""
+def _strip_blank_lines(path: Path) -> Path | io.BytesIO:
+    """Return the file, or its content without the blank lines that some editors leave at the end."""
     with path.open("rb") as file:
         file.seek(max(0, path.stat().st_size - 64))
         end = file.read()
-    blank = end[len(end.rstrip()) :].count(b"\n") > 1
-    return io.BytesIO(path.read_bytes().rstrip() + b"\n") if blank else path
+    has_blank_lines = end[len(end.rstrip()) :].count(b"\n") > 1
+    return io.BytesIO(path.read_bytes().rstrip() + b"\n") if has_blank_lines else path
 
 
-def _columns(names: list[str], place: str) -> list[str]:
-    names = [name.strip() for name in names]
-    if not {"image_id", "x", "y"} <= set(names) <= set(COLUMNS) or len(set(names)) < len(names):
-        raise PredictionsError(
-            f"{place} has columns {','.join(names)[:80]}, expected {','.join(COLUMNS)} (score, id optional)"
-        )
-    return names
-
-
-def _first_bad_row(
-    path: Path, skipped: int, names: list[str], place: Callable[[int], str], error: BaseException
-) -> PredictionsError:
+def _find_bad_row(path: Path, skipped: int, names: list[str], place: Place, error: BaseException) -> PredictionsError:
+    """Return the error for the first row that is not what pandas was told to read."""
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         for row, cells in enumerate(csv.reader(file), -1 - skipped):
             if row < 0:
@@ -138,24 +164,24 @@ def _first_bad_row(
             for name, cell in zip(names, cells, strict=True):
                 try:
                     value = int(cell) if name == "image_id" else float(cell or 0)
-                    fine = abs(value) < 2**63 if name == "image_id" else math.isfinite(value)
+                    valid = abs(value) < 2**63 if name == "image_id" else math.isfinite(value)
                 except ValueError:
-                    fine = False
-                if not fine:
+                    valid = False
+                if not valid:
                     expected = "a whole number" if name in ("image_id", "id") else "a finite number"
-                    return PredictionsError(f"{place(row)}: {name} is {short(cell)}, expected {expected}")
+                    return PredictionsError(f"{place(row)}: {name} is {abbreviate(cell)}, expected {expected}")
     return PredictionsError(f"no table ({' '.join(str(error).split())[:120]})")
 
 
-def write_csv(p: Predictions) -> bytes:
-    """The text of a ``.csv`` file."""
+def encode_csv(predictions: Predictions) -> bytes:
+    """Encode a ``.csv`` file."""
     import pandas as pd
 
-    frame = pd.DataFrame(_table(p))
+    frame = pd.DataFrame(_make_table(predictions))
     if "id" in frame:
         frame["id"] = frame["id"].astype("Int64")
     text = io.StringIO()
-    text.write(f"# {json.dumps(header_of(p), ensure_ascii=False)}\n")
+    text.write(f"# {json.dumps(make_header(predictions), ensure_ascii=False)}\n")
     frame.to_csv(text, index=False, lineterminator="\n")
     return text.getvalue().encode()
 
@@ -164,41 +190,47 @@ def write_csv(p: Predictions) -> bytes:
 
 
 def read_parquet(path: Path) -> Predictions:
-    """Read ``.parquet``: the columns of CSV, the header in the metadata."""
-    pa, pq = _pyarrow()
+    """Read a ``.parquet`` file: the columns of CSV, with the header in the metadata.
+
+    Raises
+    ------
+    PredictionsError
+        At the first fault, or if pyarrow is not installed.
+    """
+    pa, pq = _import_pyarrow()
     try:
         table = pq.read_table(path)
     except (pa.ArrowException, ValueError) as error:
         raise PredictionsError(f"damaged or no Parquet file ({' '.join(str(error).split())[:120]})") from None
     metadata = table.schema.metadata or {}
-    header = read_header(parse(metadata[b"kpbench"], "the metadata")) if b"kpbench" in metadata else {}
-    names = _columns(table.column_names, "the table")
+    header = parse_header(parse_json(metadata[b"kpbench"], "the metadata")) if b"kpbench" in metadata else {}
+    names = _check_columns(table.column_names, "the table")
     columns = {}
     for name in names:
-        whole = name == "image_id"
+        is_whole = name == "image_id"
         try:
-            column = table.column(name).cast(pa.int64() if whole else pa.float64())
-            if whole and column.null_count:
+            column = table.column(name).cast(pa.int64() if is_whole else pa.float64())
+            if is_whole and column.null_count:
                 raise ValueError("it has nulls")
             columns[name] = column.to_numpy()
         except (pa.ArrowException, ValueError) as error:
             raise PredictionsError(f"column {name} holds no plain numbers ({str(error)[:80]})") from None
-    return from_table(columns, header, lambda row: f"row {row}")
+    return build_predictions(columns, header, lambda row: f"row {row}")
 
 
-def _pyarrow() -> tuple[Any, Any]:
+def _import_pyarrow() -> tuple[Any, Any]:
     try:
         return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise PredictionsError("Parquet needs pyarrow: pip install pyarrow") from None
 
 
-def write_parquet(p: Predictions) -> bytes:
-    """The bytes of a ``.parquet`` file."""
-    pa, pq = _pyarrow()
-    types = {name: pa.int64() if name in ("image_id", "id") else pa.float64() for name in COLUMNS}
-    columns = {name: pa.array(v, types[name], from_pandas=True) for name, v in _table(p).items()}
-    table = pa.table(columns).replace_schema_metadata({"kpbench": json.dumps(header_of(p))})
+def encode_parquet(predictions: Predictions) -> bytes:
+    """Encode a ``.parquet`` file."""
+    pa, pq = _import_pyarrow()
+    types = {name: pa.int64() if name in ("image_id", "id") else pa.float64() for name in TABLE_COLUMNS}
+    columns = {name: pa.array(v, types[name], from_pandas=True) for name, v in _make_table(predictions).items()}
+    table = pa.table(columns).replace_schema_metadata({"kpbench": json.dumps(make_header(predictions))})
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink)
     return bytes(sink.getvalue())
@@ -207,13 +239,14 @@ def write_parquet(p: Predictions) -> bytes:
 # --- HDF5 ----------------------------------------------------------------------------------------------------------
 
 
-def _bytes(text: object) -> bytes:
-    """Text of an HDF5 attribute, which may be of a fixed or a variable length."""
-    return text if isinstance(text, bytes) else str(text).encode()
-
-
 def read_h5(path: Path) -> Predictions:
-    """Read ``.h5``: a dataset a column, the header in an attribute."""
+    """Read an ``.h5`` file: a dataset per column, with the header in an attribute.
+
+    Raises
+    ------
+    PredictionsError
+        At the first fault, and for data that is not stored in the file itself.
+    """
     import h5py
 
     columns: dict[str, NDArray[Any]] = {}
@@ -221,7 +254,7 @@ def read_h5(path: Path) -> Predictions:
         with h5py.File(path, "r", locking="best-effort") as file:
             header = {}
             if "header" in file.attrs:
-                header = read_header(parse(_bytes(file.attrs["header"]), "the attribute header"))
+                header = parse_header(parse_json(_to_bytes(file.attrs["header"]), "the attribute header"))
             for name in sorted(set(file) - H5_COLUMNS.keys()):
                 raise PredictionsError(f"unknown dataset /{name}, expected {', '.join(H5_COLUMNS)}")
             for name, kind in H5_COLUMNS.items():
@@ -230,10 +263,10 @@ def read_h5(path: Path) -> Predictions:
                 if not isinstance(file.get(name, getlink=True), h5py.HardLink):
                     raise PredictionsError(f"/{name} is missing or a link to elsewhere")
                 data = file[name]
-                # A file may name other files of this machine, or declare more than it holds
+                # A file may refer to other files of this machine, or declare more data than it holds
                 if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
                     raise PredictionsError(f"/{name} is not stored in this file")
-                if data.nbytes > 1100 * data.id.get_storage_size():
+                if data.nbytes > LARGEST_RATIO * data.id.get_storage_size():
                     raise PredictionsError(f"/{name} declares {data.nbytes} bytes, the file holds fewer")
                 if data.dtype.kind not in (kind + "u" if kind == "i" else "fi") or data.ndim != 1 + (name == "xy"):
                     raise PredictionsError(f"/{name} is {data.dtype} of shape {data.shape}, expected {kind}8 columns")
@@ -252,12 +285,18 @@ def read_h5(path: Path) -> Predictions:
     )
 
 
-def write_h5(p: Predictions) -> bytes:
-    """The bytes of an ``.h5`` file."""
+def _to_bytes(text: object) -> bytes:
+    """Return the text of an HDF5 attribute: h5py gives bytes for a fixed length and str for a variable one."""
+    return text if isinstance(text, bytes) else str(text).encode()
+
+
+def encode_h5(predictions: Predictions) -> bytes:
+    """Encode an ``.h5`` file."""
     import h5py
 
+    p = predictions
     with h5py.File.in_memory() as file:
-        file.attrs["header"] = json.dumps(header_of(p))
+        file.attrs["header"] = json.dumps(make_header(p))
         columns = {"image_id": p.image_id, "offsets": p.offsets, "xy": p.xy, "score": p.score, "id": p.patch_id}
         for name, values in columns.items():
             if values is not None:

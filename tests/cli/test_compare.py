@@ -4,8 +4,8 @@ import json
 import pytest
 from helpers import kpbench, write_dataset
 
-from kpbench.predictions.files import Predictions, write_predictions
-from kpbench.types import Detections
+from kpbench.predictions.files import write_predictions
+from kpbench.types import Detections, Predictions
 
 
 @pytest.fixture

@@ -10,9 +10,9 @@ from helpers import kpbench, write_dataset
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.folder import open_dataset
 from kpbench.files import sha256_of
-from kpbench.predictions.files import Predictions, write_predictions
+from kpbench.predictions.files import write_predictions
 from kpbench.scoring.metrics import COUNTS, METRICS
-from kpbench.types import Detections
+from kpbench.types import Detections, Predictions
 
 IMAGES = [[(10, 10, 10, 0), (50, 10, 10, 1)], [(10, 10, 10, 0)], [], [(30, 30, 20, 1)]]
 

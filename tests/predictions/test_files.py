@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kpbench.errors import DataError, PredictionsError
-from kpbench.predictions import decode as pieces
-from kpbench.predictions import json_files as records
-from kpbench.predictions.files import Predictions, read_predictions, write_predictions
-from kpbench.types import Detections
+from kpbench.predictions import decode, json_files
+from kpbench.predictions.files import read_predictions, write_predictions
+from kpbench.types import Detections, Predictions
 
 FORMATS = ["json", "jsonl", "csv", "parquet", "h5"]
 HEADER = {"schema": "kpbench.predictions/1"}
@@ -446,7 +445,7 @@ def test_a_file_read_in_pieces_is_the_file_read_whole(tmp_path, monkeypatch):
         write_predictions(tmp_path / name, p)
         whole = read_predictions(tmp_path / name)
         for size in (1, 50, 400):
-            for module in (pieces, records):
+            for module in (decode, json_files):
                 monkeypatch.setattr(module, "PIECE_BYTES", size)
             cut = read_predictions(tmp_path / name)
             for field in ("image_id", "offsets", "xy", "score", "patch_id"):
@@ -472,7 +471,7 @@ RECORD = '{"image_id": %d, "keypoints": [[1, 2]], "scores": [1], "ids": [0]}'
 )
 @pytest.mark.parametrize("size", [1, 10**6])
 def test_pieces_complain_as_the_whole_does(tmp_path, monkeypatch, records, problem, size):
-    monkeypatch.setattr(pieces, "PIECE_BYTES", size)
+    monkeypatch.setattr(decode, "PIECE_BYTES", size)
     path = tmp_path / "p.json"
     path.write_text(f'{{"schema": "kpbench.predictions/1", "predictions": [{records}]}}')
     with pytest.raises(PredictionsError) as error:
@@ -481,7 +480,7 @@ def test_pieces_complain_as_the_whole_does(tmp_path, monkeypatch, records, probl
 
 
 def test_what_looks_like_the_list_inside_a_text_is_not_taken_for_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(pieces, "PIECE_BYTES", 1)
+    monkeypatch.setattr(decode, "PIECE_BYTES", 1)
     path = tmp_path / "p.json"
     content = {
         "schema": "kpbench.predictions/1",

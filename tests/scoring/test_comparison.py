@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError, GateFailed
-from kpbench.predictions.files import Predictions
 from kpbench.report.report import Report, to_html, to_markdown_report
 from kpbench.scoring.comparison import COMPARED_METRICS, check_regression, compare
 from kpbench.scoring.scores import score
-from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions, Truth
 
 SCENES, RUNGS = 40, (3, 15)
 

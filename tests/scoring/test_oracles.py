@@ -7,10 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from kpbench.predictions.files import Predictions
 from kpbench.scoring.assignment import DetectionPoints, TruthPoints, match
 from kpbench.scoring.scores import score
-from kpbench.types import KEYPOINT_DTYPE, Truth
+from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth
 
 CASES = 1000
 RADII, LEVELS = np.array([0.0, 0.5, 1.0, 2.0]), np.array([0.0, 0.25, 0.5, 1e300])

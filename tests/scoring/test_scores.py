@@ -10,13 +10,12 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from kpbench.errors import DataError, GateFailed, PredictionsError
-from kpbench.predictions.files import Predictions
 from kpbench.scoring import assignment, bootstrap
 from kpbench.scoring.assignment import CLUTTER, DUPLICATE, MATCHED, NEAR_MISS, DetectionPoints, TruthPoints, match
 from kpbench.scoring.metrics import METRICS
 from kpbench.scoring.outcomes import Settings
 from kpbench.scoring.scores import check_gates, score
-from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions, Truth
 
 
 def truth_of(images, condition=None, rung=None, scene=None, image_id=None):
