@@ -16,9 +16,9 @@ import argparse
 import cv2
 import numpy as np
 
-from kpbench.render.board_view import Look, render_board
-from kpbench.synth.suite import Shot, SuiteConfig
-from kpbench.synth.suite_file import load_suite
+from kpbench import SuiteConfig, load_suite
+from kpbench.render import Appearance, render_board
+from kpbench.synth import View
 from kpbench.types import Float
 
 LENS = (-0.2, 0.05, 0.001, -0.0005, 0.01)
@@ -35,21 +35,21 @@ def conic_axes(points: Float) -> Float:
     return np.asarray(scale * np.sqrt((1 + centre @ shape @ centre) / np.linalg.eigvalsh(shape)))
 
 
-def by_opencv(config: SuiteConfig, shot: Shot, points_mm: Float) -> Float:
+def by_opencv(config: SuiteConfig, view: View, points_mm: Float) -> Float:
     points = np.column_stack([points_mm, np.zeros(len(points_mm))])
-    turn, _ = cv2.Rodrigues(shot.pose.R_board2camera)
+    turn, _ = cv2.Rodrigues(view.pose.R_board2camera)
     distortion = np.array(config.camera.distortion)
-    return cv2.projectPoints(points, turn, shot.pose.t_camera, config.camera.K, distortion)[0].reshape(-1, 2)
+    return cv2.projectPoints(points, turn, view.pose.t_camera, config.camera.K, distortion)[0].reshape(-1, 2)
 
 
-def differences(config: SuiteConfig, shot: Shot) -> tuple[float, float]:
+def differences(config: SuiteConfig, view: View) -> tuple[float, float]:
     """Largest differences of points and of axes, px."""
-    k = shot.keypoints
-    points = by_opencv(config, shot, shot.board.points_mm[:, :2]) - np.column_stack([k["x"], k["y"]])
+    k = view.keypoints
+    points = by_opencv(config, view, view.board.points_mm[:, :2]) - np.column_stack([k["x"], k["y"]])
     angles = np.radians(np.arange(720) / 2)
     unit = np.column_stack([np.cos(angles), np.sin(angles)])
     axes = [
-        conic_axes(by_opencv(config, shot, unit * b.diameter_mm / 2 + (b.x_mm, b.y_mm))) for b in shot.board.keypoints
+        conic_axes(by_opencv(config, view, unit * b.diameter_mm / 2 + (b.x_mm, b.y_mm))) for b in view.board.keypoints
     ]
     off = np.array(axes) - np.column_stack([k["radius_major"], k["radius_minor"]])
     return float(np.hypot(*points.T).max()), float(abs(off).max())
@@ -69,11 +69,11 @@ def main() -> None:
         areas, sizes, worst = [], [], np.zeros(4)
         for scene in range(scenes):
             index = rung * len(suite.patches) * scenes + scene
-            shot, shot_bent = plain.shot(index), bent.shot(index)
-            image = render_board(black, plain.camera, shot.pose, shot.board, Look(255, 255, edge=1.0)).image
+            view, bent_view = plain.view(index), bent.view(index)
+            image = render_board(black, plain.camera, view.pose, view.board, Appearance(255, 255, edge=1.0)).image
             areas.append(100 * np.count_nonzero(image > 127) / image.size)
-            sizes.append(2 * shot.keypoints["radius_major"].mean())
-            worst = np.maximum(worst, [*differences(plain, shot), *differences(bent, shot_bent)])
+            sizes.append(2 * view.keypoints["radius_major"].mean())
+            worst = np.maximum(worst, [*differences(plain, view), *differences(bent, bent_view)])
         nominal = dict(condition.pose).get("area_percent", (16.0,) * 10)[step]
         off = 100 * max(abs(np.array(areas) / nominal - 1))
         cells = [

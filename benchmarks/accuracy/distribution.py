@@ -14,9 +14,9 @@ import argparse
 import numpy as np
 
 import kpbench
-from kpbench.geometry.homography import project_discs
-from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Limits, random_placements
+from kpbench import shipped_patches
+from kpbench.geometry import project_discs
+from kpbench.render import Limits, random_placements
 from kpbench.seeds import SYNTH_SCENE, stream
 
 

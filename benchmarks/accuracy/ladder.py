@@ -1,4 +1,4 @@
-"""The ladder measured: what each effect does at each of its rungs.
+"""The ladder measured: what each effect does at each of its severity.
 
 shift   how far a patch's centre moves: 24 renders of the checker (radius 45 px, random turn and sub-pixel
         place), degraded, then least squares of the degraded image on the clean one, its two derivatives by
@@ -20,11 +20,9 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
-from kpbench.degrade.ladder import LADDER, apply, climb
-from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Placement, render_scene
-from kpbench.synth.suite import SuiteConfig
-from kpbench.synth.suite_file import load_suite
+from kpbench import SuiteConfig, load_suite, render_scene, shipped_patches
+from kpbench.degrade import LADDER, apply_effects, draw_effect
+from kpbench.render import Placement
 from kpbench.types import Float, UInt8
 
 SIDE, RADIUS, BLACK, WHITE = 256, 45.0, 50, 200
@@ -54,10 +52,10 @@ def shift(effect: str, level: float, seed: int) -> Float:
     rng = np.random.default_rng(seed)
     x, y = SIDE / 2 + rng.uniform(-4, 4, 2)  # any place on the grid of 8 x 8 blocks that JPEG uses
     turn = rng.uniform(0, 360)
-    recorded = [climb(rng, effect, level, (SIDE, SIDE), np.array([[x, y, RADIUS]]))]
+    recorded = [draw_effect(rng, effect, level, (SIDE, SIDE), np.array([[x, y, RADIUS]]))]
 
     def run(image: UInt8) -> Float:
-        return apply(image, np.random.default_rng(seed), recorded).astype(np.float64)
+        return apply_effects(image, np.random.default_rng(seed), recorded).astype(np.float64)
 
     got = run(patch(x, y, turn))
     dark, light = (run(np.full((SIDE, SIDE), v, np.uint8)) for v in (BLACK, WHITE))
@@ -92,10 +90,10 @@ def edge_width(effect: str, level: float) -> float:
     """The kernel's own measure, from the second moment of a degraded step edge's derivative."""
     step = np.full((201, 201), 20, np.uint8)
     step[:, 100:] = 220
-    recorded = climb(np.random.default_rng(0), effect, level, (201, 201))
+    recorded = draw_effect(np.random.default_rng(0), effect, level, (201, 201))
     if "angle_deg" in recorded:
         recorded["angle_deg"] = 0.0
-    profile = apply(step, np.random.default_rng(0), [recorded])[100].astype(np.float64)
+    profile = apply_effects(step, np.random.default_rng(0), [recorded])[100].astype(np.float64)
     line = np.diff(profile) / 200
     at = np.arange(len(line))
     return WIDTHS[effect](line @ (at - line @ at) ** 2)
@@ -112,20 +110,21 @@ def main() -> None:
     print(f"clean image: mean grey {sample.image.mean():.1f}")
     print("| effect | rung | unit | shift bias px | shift rms px | mean grey | PSNR dB | noise sigma | width |")
     print("|---|---|---|---|---|---|---|---|---|")
-    for effect, rungs in LADDER.items():
-        for level in rungs.levels:
+    for effect, severity in LADDER.items():
+        for level in severity.levels:
             shifts = np.array([shift(effect, level, seed) for seed in range(renders)])
             bias, rms = np.hypot(*shifts.mean(axis=0)), np.sqrt((shifts**2).sum(axis=1).mean())
             rng = np.random.default_rng(0)
-            worn = apply(sample.image, rng, [climb(rng, effect, level, (640, 480), discs)])
+            worn = apply_effects(sample.image, rng, [draw_effect(rng, effect, level, (640, 480), discs)])
             mse = np.mean((worn.astype(np.float64) - sample.image) ** 2)
             flat = np.full((480, 640), 128, np.uint8)
-            sigma = apply(flat, rng, [climb(rng, effect, level, (640, 480))]).std() if effect in RANDOM_FIELD else None
+            noisy = apply_effects(flat, rng, [draw_effect(rng, effect, level, (640, 480))])
+            sigma = noisy.std() if effect in RANDOM_FIELD else None
             width = edge_width(effect, level) if effect in WIDTHS else None
             ends = [f"{v:.2f}" if v is not None else "" for v in (sigma, width)]
             moved = [f"{v:.4f}" if np.isfinite(v) else "n/a" for v in (bias, rms)]
             numbers = [*moved, f"{worn.mean():.1f}", f"{10 * np.log10(255**2 / mse):.1f}", *ends]
-            print("| " + " | ".join([effect, f"{level:g}", rungs.unit, *numbers]) + " |")
+            print("| " + " | ".join([effect, f"{level:g}", severity.unit, *numbers]) + " |")
 
 
 if __name__ == "__main__":

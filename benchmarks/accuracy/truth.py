@@ -15,9 +15,9 @@ import sys
 
 import numpy as np
 
-from kpbench.geometry.homography import project
-from kpbench.patches.design import Patch, shipped_patches
-from kpbench.render.scene import Limits, random_placements, render_scene
+from kpbench import Patch, render_scene, shipped_patches
+from kpbench.geometry import project
+from kpbench.render import Limits, random_placements
 from kpbench.types import Float
 
 SUB = 10

@@ -25,7 +25,7 @@ from kpbench.analysis.measures import (
     pixels_needed,
     sample_windows,
 )
-from kpbench.render.background import procedural
+from kpbench.render import procedural_background
 
 HERE = Path(__file__).parents[1] / "designs"
 
@@ -130,7 +130,7 @@ def write_runner_up(windows):
 
 if __name__ == "__main__":
     rng = np.random.default_rng(0)
-    nature = sample_windows((procedural(rng, 640, 480) for _ in range(100)), rng)
+    nature = sample_windows((procedural_background(rng, 640, 480) for _ in range(100)), rng)
     bounds_table()
     limits_table(nature)
     write_runner_up(nature)

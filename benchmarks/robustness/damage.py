@@ -18,9 +18,8 @@ from pathlib import Path
 import numpy as np
 
 import kpbench
-from kpbench.dataset.generation import generate
+from kpbench import SynthConfig, generate
 from kpbench.errors import DataError
-from kpbench.synth.synthetic import SynthConfig
 
 
 def read(folder: Path) -> bytes:

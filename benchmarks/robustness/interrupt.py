@@ -24,11 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
-from kpbench.dataset.folder import open_dataset
-from kpbench.dataset.generation import generate
+from kpbench import SynthConfig, generate, open_dataset
 from kpbench.errors import DataError
 from kpbench.files import sha256_of
-from kpbench.synth.synthetic import SynthConfig
 
 CONFIG = SynthConfig(n=48, size_px=(320, 240), shard_size=4)
 WORDS = ["synth", "--n", "48", "--size", "320x240", "--shard-size", "4", "--workers", "2"]

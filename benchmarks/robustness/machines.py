@@ -18,8 +18,8 @@ from pathlib import Path
 
 import distributed
 
-from kpbench.dataset.generation import generate, generate_part, merge
-from kpbench.synth.synthetic import SynthConfig
+from kpbench import SynthConfig, generate, merge
+from kpbench.dataset.generation import generate_part
 from kpbench.workers import dask_executor
 
 

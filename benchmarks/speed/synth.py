@@ -34,11 +34,9 @@ import deflate
 import h5py
 import numpy as np
 
-from kpbench.dataset.generation import generate
+from kpbench import Patch, SynthConfig, generate, shipped_patches
 from kpbench.images import decode_photo
-from kpbench.patches.design import Patch, shipped_patches
-from kpbench.render.background import PhotoFolder
-from kpbench.synth.synthetic import SynthConfig
+from kpbench.render import PhotoFolder
 from kpbench.types import UInt8
 
 WIDTH, HEIGHT = 640, 480

@@ -79,7 +79,7 @@ def _windows(backgrounds: Path | None) -> UInt8:
     import numpy as np
 
     from kpbench.analysis.measures import sample_windows
-    from kpbench.render.background import PhotoFolder, procedural
+    from kpbench.render.background import PhotoFolder, procedural_background
 
     rng = np.random.default_rng(0)
 
@@ -92,7 +92,7 @@ def _windows(backgrounds: Path | None) -> UInt8:
                     yield image
 
     if backgrounds is None:
-        return sample_windows((procedural(rng, 640, 480) for _ in iter(int, 1)), rng)
+        return sample_windows((procedural_background(rng, 640, 480) for _ in iter(int, 1)), rng)
     return sample_windows(photographs(PhotoFolder.open(backgrounds)), rng)
 
 

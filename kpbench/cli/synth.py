@@ -86,7 +86,7 @@ def synth(
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.render.scene import Limits
+    from kpbench.render.placement import Limits
     from kpbench.synth.synthetic import SynthConfig
     from kpbench.synth.user_pipeline import load_augmentation
 

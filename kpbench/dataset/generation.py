@@ -60,7 +60,7 @@ class Recipe(Protocol):
         """The config that is written into the dataset: no path of this machine."""
         ...
 
-    def scene(self, index: int) -> int:
+    def scene_id(self, index: int) -> int:
         """The base scene of an image; shards are made scene by scene, as what a scene needs is kept."""
         ...
 
@@ -242,7 +242,7 @@ def _complete(
     progress: Progress,
 ) -> dict[str, Result]:
     """Have the shards of a plan made that are not there yet."""
-    todo = sorted((piece for piece in plan if piece[0] not in kept), key=lambda piece: config.scene(piece[1]))
+    todo = sorted((piece for piece in plan if piece[0] not in kept), key=lambda piece: config.scene_id(piece[1]))
     _check_space(folder, config.image_bytes, sum(count for _, _, count in todo))
     progress(sum(entry.count for entry, _ in kept.values()))
     results = dict(kept)

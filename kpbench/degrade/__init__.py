@@ -1,1 +1,8 @@
-"""A clean image becomes a worse one; no effect knows what a patch is."""
+"""Clean image to worse image: the effects, the ladder of their levels, and the user's own files.
+
+The functions know no patch: an effect that aims at patches takes their discs (x, y and radius in px).
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

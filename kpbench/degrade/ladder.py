@@ -1,24 +1,21 @@
-"""The ladder: which effect at which level, drawn for an image, and applied."""
+"""The ladder of effects: how severe each effect is at each level, and how an effect is drawn and applied."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from kpbench.degrade.blurs import blur, defocus, gaussian_blur, motion_blur
 from kpbench.degrade.effects import (
     Effect,
-    blur,
     brightness,
-    defocus,
     dimming,
     flare,
-    gaussian_blur,
     jpeg,
     low_light,
-    motion_blur,
     noise,
     occlusion,
     rainfall,
@@ -29,18 +26,31 @@ from kpbench.errors import DataError
 from kpbench.types import Float, UInt8
 
 Discs = Float
-"""Patches in an image that an effect may aim at, shape (n, 3): x, y and radius in px."""
-
-
+"""The patches that an effect may aim at: ndarray of shape (n, 3), x, y and radius in px."""
 Draw = Callable[[np.random.Generator, float, tuple[int, int], Discs], Effect]
+"""``draw(rng, level, (width_px, height_px), discs)`` returns the record of an effect."""
 
 
 @dataclass(frozen=True)
-class Rungs:
-    """One effect of the ladder: its levels from mild to severe, their unit, and the least and most it takes.
+class Severity:
+    """How severe an effect of the ladder is at each level.
 
-    ``draw(rng, level, (width_px, height_px), discs)`` gives the effect as a dict; what is not set by the
-    level (an angle, a place) is drawn.
+    Attributes
+    ----------
+    levels : tuple of float
+        The rungs of the suites, from mild to severe.
+    unit : str
+    bounds : (float, float)
+        Least and most that a level may be.
+    draw : callable
+        Draws the parameters that the level leaves open, such as an angle or a place, and returns the record of
+        the effect.
+
+    Examples
+    --------
+    >>> from kpbench.degrade import LADDER
+    >>> LADDER["noise"].levels, LADDER["noise"].unit
+    ((15, 30, 45, 60), 'grey levels')
     """
 
     levels: tuple[float, ...]
@@ -49,161 +59,206 @@ class Rungs:
     draw: Draw
 
 
-def _seed(rng: np.random.Generator) -> int:
+def _draw_seed(rng: np.random.Generator) -> int:
     return int(rng.integers(2**31))
 
 
-def _angle(rng: np.random.Generator, end: float) -> float:
-    return round(float(rng.uniform(0, end)), 1)
+def _draw_angle_deg(rng: np.random.Generator, end_deg: float) -> float:
+    return round(float(rng.uniform(0, end_deg)), 1)
 
 
-def _draw_motion_blur(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    return {"effect": "motion_blur", "length_px": level, "angle_deg": _angle(rng, 180)}
+def _set_parameter(effect: str, parameter: str, **fixed: Any) -> Draw:
+    """Make a draw function for an effect whose only open parameter is the level."""
+    return lambda rng, level, size_px, discs: {"effect": effect, parameter: level, **fixed}
 
 
-def _draw_shadow_edge(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """Across one of the patches, off its centre by up to half its radius."""
+def _draw_jpeg(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    return {"effect": "jpeg", "quality": float(round(level))}
+
+
+def _draw_motion_blur(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    return {"effect": "motion_blur", "length_px": level, "angle_deg": _draw_angle_deg(rng, 180)}
+
+
+def _draw_shadow_edge(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    """Draw an edge across one of the patches, up to half a radius off the patch's centre."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
     x, y = (x, y) + radius * rng.uniform(-0.5, 0.5, 2)
-    where = {"x": round(float(x), 2), "y": round(float(y), 2), "angle_deg": _angle(rng, 360)}
-    return {"effect": "shadow_edge", **where, "light": round(1 - level / 100, 6), "penumbra_px": round(radius / 8, 2)}
+    place = {"x": round(float(x), 2), "y": round(float(y), 2), "angle_deg": _draw_angle_deg(rng, 360)}
+    return {"effect": "shadow_edge", **place, "light": round(1 - level / 100, 6), "penumbra_px": round(radius / 8, 2)}
 
 
-def _draw_occlusion(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """A strip from a random side over every patch, so that ``level`` percent of its circle is hidden."""
-    reach = np.linspace(1, -1, 2001)
-    hidden = (np.arccos(reach) - reach * np.sqrt(1 - reach**2)) / np.pi  # share of a unit disc beyond x = reach
-    start = float(np.interp(level / 100, hidden, reach))
+def _draw_rainfall(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    seed, streaks = _draw_seed(rng), round(level * size_px[0] * size_px[1] / 1e6)
+    slant_deg = round(float(rng.uniform(-20, 20)), 1)
+    length_px = round(0.04 * size_px[0], 2)
+    return {"effect": "rainfall", "seed": seed, "streaks": streaks, "length_px": length_px, "slant_deg": slant_deg}
+
+
+def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    """Draw one strip per patch, from a random side, that hides ``level`` percent of the patch's disc."""
+    border = np.linspace(1, -1, 2001)
+    hidden = (np.arccos(border) - border * np.sqrt(1 - border**2)) / np.pi  # share of a unit disc beyond x = border
+    start = float(np.interp(level / 100, hidden, border))
+    end = 1.3  # radii from the patch's centre, beyond its rim
     strips = []
     for x, y, radius in discs:
-        angle_deg, grey = _angle(rng, 360), float(rng.integers(20, 236))
+        angle_deg, grey = _draw_angle_deg(rng, 360), float(rng.integers(20, 236))
         c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-        length, middle = (1.3 - start) * radius, (1.3 + start) / 2 * radius
-        strip = (x + c * middle, y + s * middle, length, 2.6 * radius)
+        length, middle = (end - start) * radius, (end + start) / 2 * radius
+        strip = (x + c * middle, y + s * middle, length, 2 * end * radius)
         strips.append([*(round(float(v), 3) for v in strip), angle_deg, grey])
     return {"effect": "occlusion", "strips": strips}
 
 
-def _draw_flare(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    """The lamp stands one to four radii beside one of the patches."""
+def _draw_flare(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
+    """Draw a lamp, one to four radii beside one of the patches."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
-    angle, away = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
-    where = {"x": round(float(x + away * np.cos(angle)), 2), "y": round(float(y + away * np.sin(angle)), 2)}
-    return {"effect": "flare", **where, "strength": level, "reach_px": round(0.15 * size[0], 2)}
+    angle, distance = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
+    place = {"x": round(float(x + distance * np.cos(angle)), 2), "y": round(float(y + distance * np.sin(angle)), 2)}
+    return {"effect": "flare", **place, "strength": level, "reach_px": round(0.15 * size_px[0], 2)}
 
 
-def _draw_rainfall(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    fixed = {"streaks": round(level * size[0] * size[1] / 1e6), "length_px": round(0.04 * size[0], 2)}
-    return {"effect": "rainfall", "seed": _seed(rng), **fixed, "slant_deg": round(float(rng.uniform(-20, 20)), 1)}
-
-
-def _set(effect: str, parameter: str, **fixed: Any) -> Draw:
-    """An effect that a level sets wholly."""
-    return lambda rng, level, size, discs: {"effect": effect, parameter: level, **fixed}
-
-
-def _draw_jpeg(rng: np.random.Generator, level: float, size: tuple[int, int], discs: Discs) -> Effect:
-    return {"effect": "jpeg", "quality": float(round(level))}
-
-
-LADDER: dict[str, Rungs] = {
-    "blur": Rungs((3, 7, 11, 15), "px", (1, 501), _set("blur", "kernel_px")),
-    "dimming": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k")),
-    "dimming-literal": Rungs((10, 20, 30, 40), "k", (0, 1000), _set("dimming", "k", law="literal")),
-    "noise": Rungs((15, 30, 45, 60), "grey levels", (0, 1000), _set("noise", "sigma")),
-    "gaussian-blur": Rungs((1, 2, 3, 4.5), "px", (0.1, 100), _set("gaussian_blur", "sigma_px")),
-    "motion-blur": Rungs((5, 10, 20, 30), "px", (0.1, 500), _draw_motion_blur),
-    "defocus": Rungs((2, 4, 6, 9), "px", (0.1, 250), _set("defocus", "radius_px")),
-    "shadow-edge": Rungs((30, 50, 70, 90), "% of the light", (0, 100), _draw_shadow_edge),
-    "rain": Rungs((500, 1000, 2000, 4000), "streaks a megapixel", (0, 1e5), _draw_rainfall),
-    "jpeg": Rungs((50, 25, 10, 5), "quality", (1, 100), _draw_jpeg),
-    "low-light": Rungs((4, 6, 8, 9), "stops", (0, 14), _set("low_light", "stops")),
-    "occlusion": Rungs((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
-    "flare": Rungs((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),
+LADDER: dict[str, Severity] = {
+    "blur": Severity((3, 7, 11, 15), "px", (1, 501), _set_parameter("blur", "kernel_px")),
+    "dimming": Severity((10, 20, 30, 40), "k", (0, 1000), _set_parameter("dimming", "k")),
+    "dimming-literal": Severity((10, 20, 30, 40), "k", (0, 1000), _set_parameter("dimming", "k", law="literal")),
+    "noise": Severity((15, 30, 45, 60), "grey levels", (0, 1000), _set_parameter("noise", "sigma")),
+    "gaussian-blur": Severity((1, 2, 3, 4.5), "px", (0.1, 100), _set_parameter("gaussian_blur", "sigma_px")),
+    "motion-blur": Severity((5, 10, 20, 30), "px", (0.1, 500), _draw_motion_blur),
+    "defocus": Severity((2, 4, 6, 9), "px", (0.1, 250), _set_parameter("defocus", "radius_px")),
+    "shadow-edge": Severity((30, 50, 70, 90), "% of the light", (0, 100), _draw_shadow_edge),
+    "rain": Severity((500, 1000, 2000, 4000), "streaks a megapixel", (0, 1e5), _draw_rainfall),
+    "jpeg": Severity((50, 25, 10, 5), "quality", (1, 100), _draw_jpeg),
+    "low-light": Severity((4, 6, 8, 9), "stops", (0, 14), _set_parameter("low_light", "stops")),
+    "occlusion": Severity((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
+    "flare": Severity((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),
 }
-"""Effect → its rungs. Stacks are effects applied one after the other."""
+"""The severity of each effect, by the effect's name."""
 
 
-def climb(
+def draw_effect(
     rng: np.random.Generator, effect: str, level: float, size_px: tuple[int, int], discs: Discs | None = None
 ) -> Effect:
-    """Draw what a level leaves open; the result goes into :func:`apply`.
+    """Draw the parameters that a level leaves open, such as an angle or a place.
 
     Parameters
     ----------
-    rng
-    effect : a key of :data:`LADDER`.
-    level : any number in the effect's unit, not only one of its rungs.
-    size_px : (width, height) of the image.
+    rng : numpy.random.Generator
+    effect : str
+        A key of :data:`LADDER`.
+    level : float
+        Any number in the effect's unit, also between the rungs.
+    size_px : (int, int)
+        Width and height of the image.
     discs : ndarray of shape (n, 3), optional
-        x, y and radius of the patches that shadow edge, occlusion and flare aim at; one random place if left out.
+        x, y and radius (px) of the patches that shadow edge, occlusion and flare aim at. Without patches, they
+        aim at one random place.
+
+    Returns
+    -------
+    dict
+        The record of the effect, for :func:`apply_effects`.
 
     Raises
     ------
     DataError
-        If there is no such effect, or the level makes no sense for it.
+        If there is no such effect, or the level is out of the effect's bounds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import draw_effect
+    >>> draw_effect(np.random.default_rng(0), "motion-blur", 10, (640, 480))
+    {'effect': 'motion_blur', 'length_px': 10, 'angle_deg': 7.4}
     """
     if effect not in LADDER:
         raise DataError(f"there is no effect {effect!r}, only: {', '.join(LADDER)}")
-    rungs = LADDER[effect]
-    low, high = rungs.bounds
+    severity = LADDER[effect]
+    low, high = severity.bounds
     if not low <= level <= high:
-        raise DataError(f"{effect} takes a level from {low:g} to {high:g} ({rungs.unit}), not {level:g}")
+        raise DataError(f"{effect} takes a level from {low:g} to {high:g} ({severity.unit}), not {level:g}")
     if discs is None or not len(discs):
         width, height = size_px
         discs = np.array([[rng.uniform(0.2, 0.8) * width, rng.uniform(0.2, 0.8) * height, 0.05 * width]])
-    return rungs.draw(rng, level, size_px, discs)
+    return severity.draw(rng, level, size_px, discs)
 
 
-def paper_mix(image: UInt8, rng: np.random.Generator) -> tuple[UInt8, list[dict[str, Any]]]:
-    """The paper's deteriorations (§2.2): one to three of six, drawn without repetition.
+def draw_paper_mix(rng: np.random.Generator) -> list[Effect]:
+    """Draw one to three of the paper's six deteriorations (§2.2), without repetition.
 
-    The paper gives no strengths; these follow the defaults of the library that it used, and the order
-    is that of light and camera: shadow, rain, motion blur, blur, brightness, noise.
+    The paper gives no strengths; these follow the defaults of the library that the paper used. The order is
+    that of light and camera: shadow, rain, motion blur, blur, brightness, noise.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
 
     Returns
     -------
-    image : ndarray of the same shape, uint8
-    effects : list of dict
-        What was applied, in order, with the parameters that were drawn.
+    list of dict
+        The records of the effects, for :func:`apply_effects`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import draw_paper_mix
+    >>> draw_paper_mix(np.random.default_rng(2))
+    [{'effect': 'motion_blur', 'length_px': 3, 'angle_deg': 53}]
     """
-    drawn: dict[str, dict[str, Any]] = {
-        "shadow": {"seed": int(rng.integers(2**31))},
-        "rain": {"seed": int(rng.integers(2**31))},
+    parameters: dict[str, dict[str, Any]] = {
+        "shadow": {"seed": _draw_seed(rng)},
+        "rain": {"seed": _draw_seed(rng)},
         "motion_blur": {"length_px": int(rng.integers(3, 10)), "angle_deg": int(rng.integers(180))},
         "blur": {"kernel_px": int(rng.choice([3, 5, 7]))},
         "brightness": {"factor": round(rng.uniform(0.5, 1.3), 3)},
         "noise": {"sigma": round(rng.uniform(5, 30), 2)},
     }
-    chosen = rng.permutation(len(drawn))[: rng.integers(1, 4)]
-    effects = [{"effect": name, **drawn[name]} for n, name in enumerate(drawn) if n in chosen]
-    return apply(image, rng, effects), effects
+    chosen = rng.permutation(len(parameters))[: rng.integers(1, 4)]
+    return [{"effect": name, **parameters[name]} for n, name in enumerate(parameters) if n in chosen]
 
 
 LADDER_MIX = (
     "occlusion", "rain", "shadow-edge", "dimming", "flare", "motion-blur", "defocus", "gaussian-blur", "blur",
     "low-light", "noise", "jpeg",
 )  # fmt: skip
-"""What :func:`ladder_mix` draws from, in the order of scene, light, lens, sensor and file."""
+"""The effects that :func:`draw_ladder_mix` draws from, in the order of scene, light, lens, sensor and file."""
 
 
-def ladder_mix(image: UInt8, rng: np.random.Generator, discs: Discs) -> tuple[UInt8, list[Effect]]:
-    """One or two effects of the ladder, at levels from nothing to their severest rung, uniform.
+def draw_ladder_mix(rng: np.random.Generator, size_px: tuple[int, int], discs: Discs | None = None) -> list[Effect]:
+    """Draw one or two effects of the ladder, at uniform levels between no effect and the severest rung.
 
-    Parameters and returns as for :func:`paper_mix`; ``discs`` as for :func:`climb`.
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    size_px : (int, int)
+        Width and height of the image.
+    discs : ndarray of shape (n, 3), optional
+        See :func:`draw_effect`.
+
+    Returns
+    -------
+    list of dict
+        The records of the effects, for :func:`apply_effects`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import draw_ladder_mix
+    >>> draw_ladder_mix(np.random.default_rng(1), (640, 480))
+    [{'effect': 'blur', 'kernel_px': 8.69}]
     """
-    size_px = (image.shape[1], image.shape[0])
     chosen = rng.permutation(len(LADDER_MIX))[: rng.integers(1, 3)]
     effects = []
     for name in (LADDER_MIX[n] for n in sorted(chosen)):
-        rungs = LADDER[name]
-        mildest = rungs.bounds[rungs.levels[0] > rungs.levels[-1]]
-        level = round(mildest + float(rng.random()) * (rungs.levels[-1] - mildest), 0 if name == "jpeg" else 2)
-        effects.append(climb(rng, name, level, size_px, discs))
-    return apply(image, rng, effects), effects
+        severity = LADDER[name]
+        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # a quality is best at its upper bound
+        level = round(harmless + float(rng.random()) * (severity.levels[-1] - harmless), 0 if name == "jpeg" else 2)
+        effects.append(draw_effect(rng, name, level, size_px, discs))
+    return effects
 
 
-FUNCTIONS: dict[str, Callable[..., UInt8]] = {
+EFFECT_FUNCTIONS: dict[str, Callable[..., UInt8]] = {
     "shadow": shadow,
     "rain": rain,
     "motion_blur": motion_blur,
@@ -220,16 +275,38 @@ FUNCTIONS: dict[str, Callable[..., UInt8]] = {
     "occlusion": occlusion,
     "flare": flare,
 }
+"""The function of each effect, by the name in the effect's record."""
+RANDOM_FIELD_EFFECTS = ("noise", "low_light")
+"""Effects that draw a random number per pixel; their records do not hold it."""
 
 
-DRAWS_A_FIELD = ("noise", "low_light")
+def apply_effects(image: UInt8, rng: np.random.Generator, effects: Sequence[Effect]) -> UInt8:
+    """Apply recorded effects to an image, in order.
 
+    Parameters
+    ----------
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+        Not changed.
+    rng : numpy.random.Generator
+        Gives the random fields of ``noise`` and ``low_light``; all else is in the records.
+    effects : sequence of dict
+        Records from :func:`draw_effect`.
 
-def apply(image: UInt8, rng: np.random.Generator, effects: list[Effect]) -> UInt8:
-    """Apply recorded effects in order; noise and low light take their fields from ``rng``."""
-    for entry in effects:
-        parameters = {key: value for key, value in entry.items() if key != "effect"}
-        if entry["effect"] in DRAWS_A_FIELD:
+    Returns
+    -------
+    ndarray of the same shape, uint8
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import apply_effects
+    >>> image = np.array([[0, 0, 90, 0, 0]], np.uint8)
+    >>> apply_effects(image, np.random.default_rng(0), [{"effect": "blur", "kernel_px": 3}])
+    array([[ 0, 30, 30, 30,  0]], dtype=uint8)
+    """
+    for record in effects:
+        parameters = {key: value for key, value in record.items() if key != "effect"}
+        if record["effect"] in RANDOM_FIELD_EFFECTS:
             parameters["rng"] = rng
-        image = FUNCTIONS[entry["effect"]](image, **parameters)
+        image = EFFECT_FUNCTIONS[record["effect"]](image, **parameters)
     return image

@@ -1,56 +1,82 @@
-"""Degrade images of the user's."""
+"""Degrade the user's own image files."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from kpbench.degrade.ladder import apply, climb
+from kpbench.degrade.effects import Effect
+from kpbench.degrade.ladder import apply_effects, draw_effect
 from kpbench.errors import DataError
 from kpbench.files import make_folder, write_atomic
 from kpbench.images import ImageSource, encode_png
 from kpbench.seeds import stream
+from kpbench.types import UInt8
 
 
 def degrade_files(
     source: ImageSource, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
-) -> Iterator[tuple[Path, list[dict[str, Any]]]]:
-    """Degrade images one by one and write them as PNG under their own names, with the folders they are in.
+) -> Iterator[tuple[Path, list[Effect]]]:
+    """Degrade images one by one and write each as PNG, under its own name and in its own subfolder of ``out``.
+
+    The n-th image written is a function of the n-th image, the steps, the seed and n.
 
     Parameters
     ----------
-    source : from :func:`kpbench.images.open_images`; what cannot be decoded is named at the end.
-    out : folder, made if it is not there; not the one that the images are in.
-    steps : (effect, level) of :data:`kpbench.degrade.LADDER`, applied in order.
-    seed : the n-th image written is a function of the n-th image, the steps, the seed and n.
+    source : ImageSource
+        From :func:`kpbench.images.open_images`.
+    out : Path
+        Folder; made if missing. It must not be the folder of the images.
+    steps : sequence of (str, float)
+        Effect and level of :data:`kpbench.degrade.LADDER`, applied in order.
+    seed : int
 
     Yields
     ------
-    path : the file that was written.
-    effects : what was applied, see :func:`kpbench.degrade.climb`.
+    path : Path
+        The file that was written.
+    effects : list of dict
+        The effects that were applied, see :func:`kpbench.degrade.draw_effect`.
 
     Raises
     ------
     DataError
-        If an effect is not known, a level is out of range, a file cannot be written, or, after all others
-        are done, if images could not be decoded.
+        If an effect is unknown, a level is out of bounds, or a file cannot be written. If images cannot be decoded,
+        after all other images are written.
+
+    Examples
+    --------
+    >>> import cv2, numpy as np
+    >>> from pathlib import Path
+    >>> from kpbench.degrade import degrade_files
+    >>> from kpbench.images import open_images
+    >>> cv2.imwrite("wall.png", np.full((30, 40), 90, np.uint8))
+    True
+    >>> for path, effects in degrade_files(open_images("wall.png"), Path("degraded"), [("blur", 7)]):
+    ...     print(path, effects)
+    degraded/wall.png [{'effect': 'blur', 'kernel_px': 7}]
     """
     broken = []
     for n, (name, image) in enumerate(source.images):
         if image is None:
             broken.append(name)
             continue
-        if (image == image[..., :1]).all():  # grey, whatever the file's mode
-            image = np.ascontiguousarray(image[..., 0])
+        image = _as_grey_if_colourless(image)
         rng = stream(seed, n, 0)
-        effects = [climb(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
-        image = apply(image, rng, effects)
+        effects = [draw_effect(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
+        image = apply_effects(image, rng, effects)
         target = out / name if name.endswith(".png") else out / f"{name}.png"
         make_folder(target.parent)
         write_atomic(target, encode_png(image))
         yield target, effects
     if broken:
         raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")
+
+
+def _as_grey_if_colourless(image: UInt8) -> UInt8:
+    """Return an RGB image whose channels are equal as a grey image, so that files of grey images stay grey."""
+    if (image == image[..., :1]).all():
+        return np.ascontiguousarray(image[..., 0])
+    return image

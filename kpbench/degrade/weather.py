@@ -1,4 +1,4 @@
-"""Random shadow and random rain, the two effects of the paper that albumentations draws."""
+"""Random shadow and random rain: the two effects of the paper that albumentations draws."""
 
 from __future__ import annotations
 
@@ -13,31 +13,53 @@ from kpbench.degrade.effects import brightness
 from kpbench.types import UInt8
 
 
-def albumentations() -> Any:
-    """The library, imported late: it is slow to import, and would look on the network for news of itself."""
-    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
-    import albumentations as library
+def import_albumentations() -> Any:
+    """Import albumentations and return the module.
 
-    return library
+    The import is slow, and therefore late. The environment variable keeps the library from asking the network for
+    a newer version.
+    """
+    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
+    import albumentations
+
+    return albumentations
 
 
 @lru_cache(maxsize=8)
 def _transform(name: str) -> Any:
-    # RandomShadow's own region of interest is the lower half of a road scene; here it is the image
+    # RandomShadow's default region of interest is the lower half of a road scene; here it is the whole image
     options = {"shadow_roi": (0, 0, 1, 1)} if name == "RandomShadow" else {}
-    return getattr(albumentations(), name)(p=1.0, **options)
+    return getattr(import_albumentations(), name)(p=1.0, **options)
 
 
-def _drawn(name: str, image: UInt8, seed: int) -> tuple[Any, dict[str, Any]]:
-    """A transform of the library, and what it draws for an image from a seed."""
+def _draw_parameters(name: str, image: UInt8, seed: int) -> tuple[Any, dict[str, Any]]:
+    """Return a transform of the library, and the parameters that the transform draws for an image from a seed."""
     transform = _transform(name)
     transform.set_random_seed(seed)
     return transform, transform.get_params_dependent_on_data({"shape": image.shape}, {})
 
 
 def shadow(image: UInt8, seed: int) -> UInt8:
-    """One or two dark polygons at half the brightness, as ``albumentations.RandomShadow`` draws them."""
-    _, drawn = _drawn("RandomShadow", image, seed)
+    """Darken one or two polygons to half their brightness, as ``albumentations.RandomShadow`` does.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+    seed : int
+        Seed of the polygons.
+
+    Returns
+    -------
+    ndarray of the same shape, uint8
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import shadow
+    >>> np.unique(shadow(np.full((60, 80), 200, np.uint8), seed=1)).tolist()
+    [100, 200]
+    """
+    _, drawn = _draw_parameters("RandomShadow", image, seed)
     result = image.copy()
     for corners, intensity in zip(drawn["vertices_list"], drawn["intensities"], strict=True):
         mask = cv2.fillPoly(np.zeros(image.shape[:2], np.uint8), [corners], 255)
@@ -46,12 +68,31 @@ def shadow(image: UInt8, seed: int) -> UInt8:
 
 
 def rain(image: UInt8, seed: int) -> UInt8:
-    """Bright streaks over a dimmed image, as ``albumentations.RandomRain`` draws them; it asks for three channels."""
-    transform, drawn = _drawn("RandomRain", image, seed)
+    """Draw bright streaks over a dimmed image, as ``albumentations.RandomRain`` does for images of three channels.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+    seed : int
+        Seed of the streaks.
+
+    Returns
+    -------
+    ndarray of the same shape, uint8
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.degrade import rain
+    >>> wet = rain(np.full((60, 80), 100, np.uint8), seed=1)
+    >>> int(wet.min()), bool(wet.max() > 100)
+    (70, True)
+    """
+    transform, drawn = _draw_parameters("RandomRain", image, seed)
     start = drawn["rain_drops"]
     lines = np.stack([start, start + np.array([drawn["slant"], drawn["drop_length"]])], axis=1).astype(np.int32)
     layer = np.zeros_like(image)
     cv2.polylines(layer, list(lines), False, transform.drop_color, transform.drop_width, cv2.LINE_4)
-    reach = (transform.blur_value, transform.blur_value)
-    lit = cv2.add(image, cv2.blur(layer, reach))
+    kernel = (transform.blur_value, transform.blur_value)
+    lit = cv2.add(image, cv2.blur(layer, kernel))
     return np.asarray(cv2.multiply(lit, transform.brightness_coefficient, dtype=cv2.CV_8U), np.uint8)

@@ -1,1 +1,9 @@
-"""Patches before a background: a clean image and its truth."""
+"""Patches before a background: a clean image and its truth.
+
+Two kinds of scene: single patches in random poses (``render_scene``), and one board before a camera
+(``render_board``). Both paint by exact area coverage.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""Backgrounds: crops of the user's photographs, or a procedural texture with natural statistics."""
+"""Backgrounds of images: crops of the user's photographs, or procedural textures with natural statistics."""
 
 from __future__ import annotations
 
@@ -20,32 +20,56 @@ from kpbench.images import decode_photo
 from kpbench.types import Float, UInt8
 
 CACHE_BYTES = 128 * 2**20
+"""Most memory that the decoded photographs of a :class:`PhotoFolder` take, bytes."""
+LEAVES = 700
+"""Number of shapes in a procedural background; together they cover the image about twice."""
+LEAF_RADIUS = (0.008, 0.35)
+"""Smallest and largest radius of such a shape, as a fraction of the image's longer side."""
+TEXTURE_OCTAVES = 7
+"""Number of layers of smooth noise in a procedural background; each has half the resolution of the one before."""
 
 
 @dataclass(frozen=True)
 class Background:
-    """One background and where it came from.
+    """One background and its origin.
 
     Attributes
     ----------
-    image : ndarray of shape (H, W) or (H, W, 3), uint8, RGB.
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+        Grey or RGB.
     file : str
-        Path of the photograph below the folder, "" for a procedural one.
-    broken : tuple of str
-        Files that were to be used and could not be decoded.
+        Path of the photograph below its folder, "" for a procedural background.
+    broken_files : tuple of str
+        Files that were drawn first and could not be decoded.
     """
 
     image: UInt8
     file: str = ""
-    broken: tuple[str, ...] = ()
+    broken_files: tuple[str, ...] = ()
 
 
 @dataclass
 class PhotoFolder:
-    """Photographs below a folder, of any size, mode and nesting, some of them broken.
+    """Photographs below a folder, of any size, mode and nesting; some of them may be broken.
 
-    ``files`` is the sorted list of paths below ``path``, so that the n-th file is the same on every
-    machine. Decoded photographs are kept in a cache of bounded size; it changes no result.
+    Decoded photographs are kept in a cache of bounded size, which changes no result.
+
+    Attributes
+    ----------
+    path : Path
+    files : tuple of str
+        Sorted paths below ``path``, so that the n-th file is the same on every machine.
+
+    Examples
+    --------
+    >>> import cv2, numpy as np
+    >>> from kpbench.render import PhotoFolder
+    >>> cv2.imwrite("wall.png", np.full((300, 400), 90, np.uint8))
+    True
+    >>> photos = PhotoFolder.open(".")
+    >>> background = photos.sample(np.random.default_rng(0), 64, 48, channels=1)
+    >>> background.file, background.image.shape
+    ('wall.png', (48, 64))
     """
 
     path: Path
@@ -55,17 +79,17 @@ class PhotoFolder:
 
     @classmethod
     def open(cls, path: str | Path) -> PhotoFolder:
-        """List a folder and make sure that at least one photograph in it can be decoded.
+        """List a folder and make sure that at least one photograph in the folder can be decoded.
 
         Raises
         ------
         DataError
-            If the folder does not exist, holds no image file, or holds none that can be decoded.
+            If the folder does not exist, holds no image file, or holds no image file that can be decoded.
         """
         folder = Path(path)
         if not folder.is_dir():
-            what = "a file, expected a folder" if folder.exists() else "no such folder"
-            raise DataError(f"{folder}: {what} of background images")
+            problem = "a file, expected a folder" if folder.exists() else "no such folder"
+            raise DataError(f"{folder}: {problem} of background images")
         files = image_files(folder)
         if not files:
             expected = ", ".join(IMAGE_SUFFIXES)
@@ -77,17 +101,30 @@ class PhotoFolder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over names and sizes of all files: tells whether the folder has changed."""
+        """SHA-256 over the names and sizes of all files, which shows whether the folder has changed."""
         listing = "\n".join(f"{name}\t{(self.path / name).stat().st_size}" for name in self.files)
         return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
     def decode(self, name: str, channels: int) -> UInt8 | None:
-        """One whole photograph, (H, W) or (H, W, 3) in RGB; None if it is broken."""
+        """Decode one whole photograph.
+
+        Parameters
+        ----------
+        name : str
+            An entry of ``files``.
+        channels : {1, 3}
+            1 for grey, 3 for RGB.
+
+        Returns
+        -------
+        ndarray of shape (H, W) or (H, W, 3), uint8, or None
+            None if the file is broken.
+        """
         key = (name, channels)
         if key in self._cache:
             self._cache.move_to_end(key)
             return self._cache[key]
-        image = decode_photo((self.path / name), channels)
+        image = decode_photo(self.path / name, channels)
         self._cache[key] = image
         self._cached_bytes += 0 if image is None else image.nbytes
         while self._cached_bytes > CACHE_BYTES and len(self._cache) > 1:
@@ -95,17 +132,31 @@ class PhotoFolder:
             self._cached_bytes -= 0 if dropped is None else dropped.nbytes
         return image
 
-    def _from(self, first: int) -> Iterator[str]:
+    def _files_from(self, first: int) -> Iterator[str]:
+        """Yield all files, from the one with number ``first`` to the end, then from the start."""
         yield from self.files[first:]
         yield from self.files[:first]
 
     def sample(self, rng: np.random.Generator, width_px: int, height_px: int, channels: int) -> Background:
-        """A random crop of a random photograph, mirrored half of the time, resized to the size asked for.
+        """Draw a random crop of a random photograph, mirrored with probability 0.5 and resized.
 
-        A broken file is passed over for the next one in the list, so the random numbers drawn do not
-        depend on it.
+        In place of a broken file the next file of the list is taken. The random numbers that are drawn do
+        therefore not depend on which files are broken.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+        width_px, height_px : int
+            Size of the background.
+        channels : {1, 3}
+            1 for grey, 3 for RGB.
+
+        Raises
+        ------
+        DataError
+            If no file can be decoded any more.
         """
-        first, zoom, fx, fy, mirror = (
+        first, zoom, x_fraction, y_fraction, mirror = (
             int(rng.integers(len(self.files))),
             rng.uniform(0.5, 1.0),
             rng.random(),
@@ -113,70 +164,124 @@ class PhotoFolder:
             rng.random() < 0.5,
         )
         broken: list[str] = []
-        for name in self._from(first):
+        for name in self._files_from(first):
             photo = self.decode(name, channels)
             if photo is not None:
-                image = _crop(photo, width_px, height_px, zoom, fx, fy)
+                image = _crop_and_resize(photo, width_px, height_px, zoom, x_fraction, y_fraction)
                 return Background(np.ascontiguousarray(image[:, ::-1]) if mirror else image, name, tuple(broken))
             broken.append(name)
         raise DataError(f"{self.path}: its image files can no longer be decoded")
 
 
-def _crop(photo: UInt8, width_px: int, height_px: int, zoom: float, fx: float, fy: float) -> UInt8:
+def describe_backgrounds(photos: PhotoFolder | None) -> dict[str, Any]:
+    """Return what the config of a dataset says about the backgrounds, without a path."""
+    if photos is None:
+        return {"kind": "procedural"}
+    return {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
+
+
+def _crop_and_resize(
+    photo: UInt8, width_px: int, height_px: int, zoom: float, x_fraction: float, y_fraction: float
+) -> UInt8:
+    """Cut a window out of a photograph and resize the window.
+
+    ``zoom`` is the size of the window relative to the largest one that fits. The two fractions place the
+    window: 0 at the left or upper border, 1 at the right or lower border.
+    """
     rows, columns = photo.shape[:2]
     scale = zoom * min(columns / width_px, rows / height_px)
     w, h = max(1, round(width_px * scale)), max(1, round(height_px * scale))
-    x, y = int(fx * (columns - w + 1)), int(fy * (rows - h + 1))
-    how = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(photo[y : y + h, x : x + w], (width_px, height_px), interpolation=how), np.uint8)
+    x, y = int(x_fraction * (columns - w + 1)), int(y_fraction * (rows - h + 1))
+    interpolation = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    window = photo[y : y + h, x : x + w]
+    return np.asarray(cv2.resize(window, (width_px, height_px), interpolation=interpolation), np.uint8)
 
 
-def procedural(rng: np.random.Generator, width_px: int, height_px: int, channels: int = 1) -> UInt8:
-    """A background without photographs: dead leaves under 1/f texture.
+def procedural_background(rng: np.random.Generator, width_px: int, height_px: int, channels: int = 1) -> UInt8:
+    """Draw a background that needs no photographs: dead leaves under 1/f texture.
 
-    Opaque shapes of random size, position and grey that hide each other, with radii of density r⁻³,
-    have the scale-invariant edges of natural images (Lee, Mumford and Huang, *Occlusion models for
-    natural images*, IJCV 2001); octaves of smooth noise add surface texture with a 1/f spectrum.
+    Opaque shapes of random size, position and grey hide each other. Their radii have the density r⁻³, which
+    gives the scale-invariant edges of natural images [1]_. Octaves of smooth noise add a surface texture with
+    a 1/f spectrum.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+    width_px, height_px : int
+    channels : {1, 3}
+        1 for grey, 3 for RGB.
 
     Returns
     -------
     ndarray of shape (height_px, width_px) or (height_px, width_px, 3), uint8
+
+    References
+    ----------
+    .. [1] Lee, Mumford and Huang, *Occlusion models for natural images: a statistical study of a
+       scale-invariant dead leaves model*, IJCV 41, 2001.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.render import procedural_background
+    >>> procedural_background(np.random.default_rng(0), 64, 48).shape
+    (48, 64)
     """
-    long_side = max(width_px, height_px)
     canvas = np.full((height_px, width_px, channels), round(rng.uniform(40, 215)), np.uint8)
-    count, smallest, largest = 700, 0.008, 0.35  # radii in long sides; so many cover the frame about twice
-    radius = smallest * long_side / np.sqrt(1 - rng.random(count) * (1 - (smallest / largest) ** 2))
-    centre = rng.uniform(0, 1, (count, 2)) * (width_px, height_px)
-    ratio, angle = rng.uniform(0.3, 1.0, count), rng.uniform(0, 360, count)
-    grey = np.clip(rng.normal(127, 62, (count, 1)) + rng.normal(0, 18, (count, channels)), 0, 255).round()
-    square = rng.random(count) < 0.4
-    round_ = _leaves(_circle(48), centre, radius, ratio, angle)
-    edged = _leaves(np.sqrt(2) * _circle(4, 45), centre, radius, ratio, angle)
-    for is_square, ellipse, corners, colour in zip(square.tolist(), round_, edged, grey.tolist(), strict=True):
-        cv2.fillConvexPoly(canvas, corners if is_square else ellipse, colour, cv2.LINE_8, 4)
-    strength = rng.uniform(2, 14)
-    sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, 8)]
-    octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
-    texture: Any = np.zeros((2, 2), np.float32)
-    for octave in range(7, 0, -1):  # from coarse to fine, each on top of the ones before
-        texture = cv2.resize(texture, sizes[octave - 1])
-        texture += np.float32(strength * 2 ** (octave / 2 - 2)) * octaves[octave - 1]
-    texture = cv2.resize(texture, (width_px, height_px))
+    smallest, largest = LEAF_RADIUS
+    # the inverse of the radius' distribution function, truncated at the largest radius
+    radius_px = smallest * max(width_px, height_px) / np.sqrt(1 - rng.random(LEAVES) * (1 - (smallest / largest) ** 2))
+    centre_px = rng.uniform(0, 1, (LEAVES, 2)) * (width_px, height_px)
+    ratio, angle_deg = rng.uniform(0.3, 1.0, LEAVES), rng.uniform(0, 360, LEAVES)
+    grey = np.clip(rng.normal(127, 62, (LEAVES, 1)) + rng.normal(0, 18, (LEAVES, channels)), 0, 255).round()
+    is_rectangle = rng.random(LEAVES) < 0.4
+    ellipses = _place_polygon(_circle_corners(48), centre_px, radius_px, ratio, angle_deg)
+    rectangles = _place_polygon(np.sqrt(2) * _circle_corners(4, 45), centre_px, radius_px, ratio, angle_deg)
+    for n, colour in enumerate(grey.tolist()):
+        cv2.fillConvexPoly(canvas, (rectangles if is_rectangle[n] else ellipses)[n], colour, cv2.LINE_8, 4)
+    texture = _octave_noise(rng, width_px, height_px)
     smooth = cv2.GaussianBlur(canvas, (0, 0), 0.7)
     if channels == 3:
         texture = cv2.merge([texture] * 3)
     return np.asarray(cv2.add(smooth, texture, dtype=cv2.CV_8U), np.uint8)
 
 
-def _circle(count: int, start_deg: float = 0.0) -> Float:
-    """Corners on the unit circle, shape (count, 2)."""
+def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
+    """Sum of smooth noise at all resolutions, ndarray of shape (height_px, width_px), float32, grey levels."""
+    strength = rng.uniform(2, 14)
+    sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
+    octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
+    texture: Any = np.zeros((2, 2), np.float32)
+    for octave in range(TEXTURE_OCTAVES, 0, -1):  # from coarse to fine
+        texture = cv2.resize(texture, sizes[octave - 1])
+        texture += np.float32(strength * 2 ** (octave / 2 - 2)) * octaves[octave - 1]
+    return cv2.resize(texture, (width_px, height_px))
+
+
+def _circle_corners(count: int, start_deg: float = 0.0) -> Float:
+    """Corners of a regular polygon on the unit circle, ndarray of shape (count, 2)."""
     angles = np.radians(start_deg) + np.arange(count) * (2 * np.pi / count)
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
 
-def _leaves(corners: Float, centre: Float, radius: Float, ratio: Float, angle_deg: Float) -> NDArray[np.int32]:
-    """One polygon stretched, turned and placed many times, in 1/16 px as OpenCV draws: (count, corners, 2)."""
+def _place_polygon(
+    corners: Float, centre_px: Float, radius_px: Float, ratio: Float, angle_deg: Float
+) -> NDArray[np.int32]:
+    """Stretch, turn and move one polygon to many places.
+
+    Parameters
+    ----------
+    corners : ndarray of shape (k, 2)
+    centre_px : ndarray of shape (n, 2)
+    radius_px, ratio, angle_deg : ndarray of shape (n,)
+        Semi-axis along x before the turn, semi-axis along y as a fraction of it, and the turn.
+
+    Returns
+    -------
+    ndarray of shape (n, k, 2), int32
+        Corners in 1/16 px, the unit of OpenCV's drawing functions.
+    """
     c, s = np.cos(np.radians(angle_deg))[:, None], np.sin(np.radians(angle_deg))[:, None]
-    u, v = corners[:, 0] * radius[:, None], corners[:, 1] * (radius * ratio)[:, None]
-    points = np.stack([c * u - s * v, s * u + c * v], axis=-1) + centre[:, None]
+    u, v = corners[:, 0] * radius_px[:, None], corners[:, 1] * (radius_px * ratio)[:, None]
+    points = np.stack([c * u - s * v, s * u + c * v], axis=-1) + centre_px[:, None]
     return np.rint(points * 16).astype(np.int32)

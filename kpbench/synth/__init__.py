@@ -1,1 +1,5 @@
-"""What a synthetic set or a suite is a function of."""
+"""Synthetic sets and benchmark suites: the configurations that determine every image."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

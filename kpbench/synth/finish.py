@@ -1,24 +1,110 @@
-"""Degrade a rendered scene and carry its truth along."""
+"""The last steps of every synthetic image: degrade a rendered scene and carry its truth along."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench.degrade.effects import Effect, occlusion_cover
+from kpbench.degrade.ladder import apply_effects
 from kpbench.geometry.coverage import clip_to_image
-from kpbench.render.scene import Mask
+from kpbench.render.placement import Placement
+from kpbench.render.scene import Mask, Rendering, fraction_inside, keypoint_table, measure_contrast, rasterise_patches
+from kpbench.synth.user_pipeline import run_pipeline
 from kpbench.types import Float, UInt8
 
 
-def share_open(image: UInt8, effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
-    """The fraction of what is in the image of each patch (n,) that the occlusions among these effects leave open."""
-    strips = [effect["strips"] for effect in effects if effect["effect"] == "occlusion"]
-    share = np.ones(len(masks))
-    for n, mask in enumerate(masks) if strips else ():
-        open_ = disc = mask.disc[clip_to_image(mask.box, image)[1]]
-        for one in strips:
-            open_ = open_ * (1 - occlusion_cover(one, mask.box))[clip_to_image(mask.box, image)[1]]
-        share[n] = open_.sum() / max(disc.sum(), 1e-9)
-    return share
+def discs_of(keypoints: NDArray[Any]) -> Float:
+    """Return x, y and radius (px) of each keypoint's patch, shape (n, 3): the targets of effects that aim."""
+    return np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
+
+
+def degrade_scene(scene: Rendering, rng: np.random.Generator, effects: Sequence[Effect]) -> Rendering:
+    """Apply effects to a rendered scene.
+
+    Parameters
+    ----------
+    scene : Rendering
+        Not changed.
+    rng : numpy.random.Generator
+        See :func:`kpbench.degrade.apply_effects`.
+    effects : sequence of dict
+        Records of the effects.
+
+    Returns
+    -------
+    Rendering
+        Poses are the same, as no effect moves the image. Occlusions lower ``visible``; ``contrast`` is measured in
+        the degraded image.
+    """
+    image, keypoints = apply_effects(scene.image, rng, effects), scene.keypoints.copy()
+    keypoints["visible"] *= unoccluded_fraction(image, effects, scene.masks)
+    keypoints["contrast"] = measure_contrast(image, scene.masks)
+    return Rendering(image, keypoints, scene.masks)
+
+
+def augment_scene(
+    scene: Rendering, placements: Sequence[Placement], effects: Sequence[Effect], pipeline: str, seed: int
+) -> Rendering:
+    """Send a degraded scene through the user's albumentations pipeline, which may move patches.
+
+    Parameters
+    ----------
+    scene : Rendering
+        Not changed.
+    placements : sequence of Placement
+        The patches of the scene.
+    effects : sequence of dict
+        The effects that were applied: a patch keeps the fraction that occlusions left visible.
+    pipeline : str
+        From :func:`kpbench.synth.load_augmentation`.
+    seed : int
+        Seed of all that the pipeline draws.
+
+    Returns
+    -------
+    Rendering
+        Without the patches whose centre has left the image.
+
+    Raises
+    ------
+    DataError
+        See :func:`kpbench.synth.user_pipeline.run_pipeline`.
+    """
+    unoccluded = unoccluded_fraction(scene.image, effects, scene.masks)
+    image, moved = run_pipeline(scene.image, placements, pipeline, seed)
+    remaining = [placement for placement in moved if placement is not None]
+    masks = tuple(rasterise_patches(remaining))
+    keypoints = keypoint_table(remaining, [fraction_inside(image, mask) for mask in masks])
+    keypoints["visible"] *= unoccluded[[placement is not None for placement in moved]]
+    keypoints["contrast"] = measure_contrast(image, masks)
+    return Rendering(image, keypoints, masks)
+
+
+def unoccluded_fraction(image: UInt8, effects: Sequence[Effect], masks: Sequence[Mask]) -> Float:
+    """Compute the fraction of each patch that occlusions leave uncovered.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+        Parts of a patch outside the image do not count.
+    effects : sequence of dict
+        Records of effects; only occlusions matter.
+    masks : sequence of Mask
+
+    Returns
+    -------
+    ndarray of shape (n,), float64
+    """
+    occlusions = [effect["strips"] for effect in effects if effect["effect"] == "occlusion"]
+    fraction = np.ones(len(masks))
+    for n, mask in enumerate(masks) if occlusions else ():
+        _, in_box = clip_to_image(mask.box, image)
+        uncovered = disc = mask.disc[in_box]
+        for strips in occlusions:
+            uncovered = uncovered * (1 - occlusion_cover(strips, mask.box))[in_box]
+        fraction[n] = uncovered.sum() / max(disc.sum(), 1e-9)
+    return fraction

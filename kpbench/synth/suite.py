@@ -1,9 +1,9 @@
-"""Suites: the benchmark's experiments as data, and the recipe of every image in them.
+"""Suites: the configuration that determines every image of a benchmark suite, and how one image is made.
 
-A suite is a TOML file (``benchmarks/suites``): a camera, what a scene may look like, and conditions with
-their rungs. Image and truth are a function of (suite, seed, size, lens, background files) and of nothing
-else. One base scene - background, pose, inks, light - is seen with every patch under every rung, and its
-images share their ``scene_id``; so do the random numbers of the effects. Comparisons are paired.
+Image and truth are a function of the suite, the seed, the size, the lens and the background files.
+A base scene consists of background, pose, inks and light. Every scene is seen with every patch under every
+rung; its images share their ``scene_id`` and the random numbers of the effects. Comparisons are therefore
+paired.
 """
 
 from __future__ import annotations
@@ -18,57 +18,99 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.dataset.shard import Sample
-from kpbench.degrade.ladder import apply, climb
+from kpbench.degrade.effects import Effect
+from kpbench.degrade.ladder import draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import BoardLike, hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
-from kpbench.render.background import Background, PhotoFolder, procedural
-from kpbench.render.board_view import Look, Pose, board_keypoints, pose_board, render_board
-from kpbench.render.scene import measure_contrast
+from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
+from kpbench.render.board_projection import Pose, pose_board
+from kpbench.render.board_view import Appearance, board_keypoints, render_board
 from kpbench.seeds import SUITE_BACKGROUND, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, stream
-from kpbench.synth.finish import share_open
+from kpbench.synth.finish import degrade_scene, discs_of
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float
 
-BOARD_SIDE_MM = 187.5  # a disc of 30 mm
+BOARD_SIDE_MM = 187.5
+"""Side of every board: a disc of the hexagon board then has 30 mm."""
 
 
 @dataclass(frozen=True)
-class Shot:
-    """What one image of a suite will show, before anything is painted."""
+class View:
+    """Everything that one image of a suite will show, before anything is painted.
+
+    Attributes
+    ----------
+    condition : str
+    rung : float
+    scene_id : int
+        The base scene.
+    board : Board or TagBoard
+    pose : Pose
+    appearance : Appearance
+    effects : list of dict
+        Records of the effects, see :func:`kpbench.degrade.draw_effect`.
+    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
+        The truth before occlusion; ``contrast`` is nan.
+
+    Examples
+    --------
+    >>> from kpbench import SuiteConfig, load_suite
+    >>> view = SuiteConfig(load_suite("paper-v1"), images=2).view(0)
+    >>> view.condition, view.rung, len(view.keypoints)
+    ('scale', 0.5, 6)
+    """
 
     condition: str
     rung: float
-    scene: int
+    scene_id: int
     board: BoardLike
     pose: Pose
-    look: Look
-    effects: list[dict[str, Any]]
+    appearance: Appearance
+    effects: list[Effect]
     keypoints: NDArray[Any]
 
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """All that a suite's images are a function of, besides the background files.
+    """Configuration of a suite's images: with the background files, it determines every image.
 
     Attributes
     ----------
     suite : Suite
-    images : base scenes; None for the suite's own number. Fewer are the first of more.
-    seed : any whole number from 0.
-    size_px : (width, height); None for the suite's own. The field of view stays.
-    only : names of conditions; empty for all.
-    backgrounds : folder of photographs, or None for procedural ones.
-    distortion : OpenCV's k1, k2, p1, p2, k3; what is left out is 0.
-    board : one of :data:`kpbench.patches.TAG_BOARDS` in the place of the suite's boards of patches, or None.
-    shard_size : images a shard; changes the files but no image.
+    images : int or None
+        Number of base scenes, None for the suite's own number. A smaller number gives the first of the same scenes.
+    seed : int
+        0 or more.
+    size_px : (int, int) or None
+        Width and height, None for the suite's own. The horizontal field of view stays the same.
+    only : tuple of str
+        Names of the conditions to make; all if empty.
+    backgrounds : Path or None
+        Folder of photographs, or None for procedural backgrounds.
+    distortion : tuple of float
+        Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; the others are 0.
+    board : str or None
+        A name of :data:`kpbench.patches.TAG_BOARDS`, to show that board of tags and no patches.
+    shard_size : int
+        Images per shard; changes the files but no image.
 
     Raises
     ------
     DataError
-        If a value is out of its range or a condition is not known.
+        If a value is out of its range or a condition is unknown.
+
+    Examples
+    --------
+    >>> from kpbench import SuiteConfig, load_suite
+    >>> config = SuiteConfig(load_suite("paper-v1"), images=2, size_px=(203, 155), only=("blur",))
+    >>> config.n  # 4 rungs x 4 patches x 2 scenes
+    32
+    >>> sample, broken_files = config.make(31)
+    >>> sample.condition, sample.rung, sample.effects
+    ('blur', 15.0, [{'effect': 'blur', 'kernel_px': 15.0}])
     """
 
     suite: Suite
@@ -82,20 +124,27 @@ class SuiteConfig:
     shard_size: int = 100  # 200 MB of pixels at 1624x1240
 
     def __post_init__(self) -> None:
-        def need(good: bool, what: str) -> None:
-            if not good:
-                raise DataError(what)
-
         width, height = self.camera.width_px, self.camera.height_px
-        need(1 <= self.scenes <= 10**6, f"--images is {self.scenes}, expected a number of scenes from 1 to 1,000,000")
-        need(self.seed >= 0, f"--seed is {self.seed}, expected a whole number from 0")
-        need(min(width, height) >= 64, f"--size is {width}x{height}, expected at least 64x64")
-        need(max(width, height) <= 16384, f"--size is {width}x{height}, at most 16384 a side")
-        need(self.shard_size >= 1, f"the shard size is {self.shard_size}, expected a number of images from 1")
-        need(self.board in (None, *TAG_BOARDS), f"--board is {self.board}, expected one of: {', '.join(TAG_BOARDS)}")
+        for is_valid, problem in (
+            (
+                1 <= self.scenes <= 10**6,
+                f"`images` is {self.scenes}, expected a number of scenes from 1 to 1,000,000",
+            ),
+            (self.seed >= 0, f"`seed` is {self.seed}, expected a whole number from 0"),
+            (min(width, height) >= 64, f"`size_px` is {width}x{height}, expected at least 64x64"),
+            (max(width, height) <= 16384, f"`size_px` is {width}x{height}, at most 16384 a side"),
+            (self.shard_size >= 1, f"`shard_size` is {self.shard_size}, expected a number of images from 1"),
+            (
+                self.board in (None, *TAG_BOARDS),
+                f"`board` is {self.board}, expected one of: {', '.join(TAG_BOARDS)}",
+            ),
+        ):
+            if not is_valid:
+                raise DataError(problem)
         known = [c.name for c in self.suite.conditions]
         for name in self.only:
-            need(name in known, f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
+            if name not in known:
+                raise DataError(f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
 
     @property
     def scenes(self) -> int:
@@ -104,25 +153,25 @@ class SuiteConfig:
 
     @cached_property
     def camera(self) -> Camera:
-        """The camera at the size asked for."""
+        """The camera at the configured size."""
         return self.suite.camera(self.size_px, self.distortion)
 
     @cached_property
     def rungs(self) -> tuple[tuple[Condition, int], ...]:
-        """Every rung in the order of the images, as (condition, position in it)."""
+        """Every rung in the order of the images: its condition, and its position among the condition's rungs."""
         chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
     @cached_property
     def boards(self) -> tuple[BoardLike, ...]:
-        """The boards that are seen in every scene under every rung."""
+        """The boards that every scene shows under every rung."""
         if self.board is not None:
             return (tag_board(self.board, BOARD_SIDE_MM),)
         return tuple(hexagon_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
 
     @property
     def name(self) -> str:
-        """Of the suite, and of the board if it is not the suite's own."""
+        """Name of the suite, followed by the name of the board of tags if there is one."""
         return self.suite.name if self.board is None else f"{self.suite.name}-{self.board}"
 
     @property
@@ -132,31 +181,31 @@ class SuiteConfig:
 
     @property
     def image_bytes(self) -> int:
-        """Expected size on disk of one image."""
+        """Expected size of one image on disk."""
         return int(0.6 * self.camera.width_px * self.camera.height_px)
 
     @cached_property
     def photos(self) -> PhotoFolder | None:
-        """The listed background folder."""
+        """The opened folder of photographs, None for procedural backgrounds."""
         return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
 
     @cached_property
-    def _kept(self) -> dict[int, Background]:
+    def _background_cache(self) -> dict[int, Background]:
+        """Backgrounds by base scene."""
         return {}
 
     def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key not in ("photos", "_kept")}
+        return {key: value for key, value in self.__dict__.items() if key not in ("photos", "_background_cache")}
 
     def to_dict(self) -> dict[str, Any]:
-        """What is written into the dataset: no path, so that a moved folder gives the same bytes."""
-        photos, camera = self.photos, self.camera
-        source: dict[str, Any] = {"kind": "procedural"}
-        if photos is not None:
-            source = {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
-        conditions = {c.name: c for c, _ in self.rungs}.values()
-        shown: dict[str, Any] = {"patches": [patch.to_dict() for patch in self.suite.patches]}
+        """Return the config that is written into the dataset.
+
+        It holds no path, so that a moved background folder gives the same bytes.
+        """
+        camera, conditions = self.camera, {c.name: c for c, _ in self.rungs}.values()
+        targets: dict[str, Any] = {"patches": [patch.to_dict() for patch in self.suite.patches]}
         if self.board is not None:
-            shown = {"board": tag_board(self.board, BOARD_SIDE_MM).to_dict()}
+            targets = {"board": tag_board(self.board, BOARD_SIDE_MM).to_dict()}
         return {
             "kind": "suite",
             "suite": self.suite.name,
@@ -167,80 +216,133 @@ class SuiteConfig:
             "focal_px": camera.focal_px,
             "distortion": list(camera.distortion),
             "shard_size": self.shard_size,
-            "backgrounds": source,
+            "backgrounds": describe_backgrounds(self.photos),
             "scene": {key: list(span) for key, span in self.suite.scene},
-            "conditions": [_listed(c) for c in conditions],
-            **shown,
+            "conditions": [_describe_condition(c) for c in conditions],
+            **targets,
         }
 
-    def scene(self, index: int) -> int:
-        """The base scene of an image: images are ordered by condition, rung, board and scene."""
+    def scene_id(self, index: int) -> int:
+        """Return the base scene of an image: images are ordered by condition, rung, board and scene."""
         return index % self.scenes
 
-    def shot(self, index: int) -> Shot:
-        """Pose, light, effects and truth of one image; nothing is painted."""
-        scene = self.scene(index)
-        rung, which = divmod(index // self.scenes, len(self.boards))
+    def view(self, index: int) -> View:
+        """Draw pose, light and effects of one image and compute its truth; nothing is painted.
+
+        Parameters
+        ----------
+        index : int
+            0 to n − 1.
+        """
+        scene_id = self.scene_id(index)
+        rung, which_board = divmod(index // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
-        rng = stream(self.seed, scene, SUITE_SCENE)
+        board = self.boards[which_board]
+        rng = stream(self.seed, scene_id, SUITE_SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
-        tilt = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
-        board = self.boards[which]
-        shift = (drawn["shift_x"], drawn["shift_y"])
-        pose = pose_board(self.camera, board, drawn["area_percent"], shift=shift, **tilt)
-        slope = (drawn["slope_x"], drawn["slope_y"])
-        look = Look(drawn["black"], drawn["white"], drawn["edge"], drawn["light"], slope, drawn["shadow"])
+        pose = pose_board(
+            self.camera,
+            board,
+            drawn["area_percent"],
+            pitch_deg=drawn["pitch_deg"],
+            yaw_deg=drawn["yaw_deg"],
+            roll_deg=drawn["roll_deg"],
+            shift=(drawn["shift_x"], drawn["shift_y"]),
+        )
+        appearance = Appearance(
+            drawn["black"],
+            drawn["white"],
+            drawn["edge"],
+            drawn["light"],
+            slope=(drawn["slope_x"], drawn["slope_y"]),
+            shadow=drawn["shadow"],
+        )
         keypoints = board_keypoints(self.camera, pose, board)
-        discs = np.column_stack([keypoints["x"], keypoints["y"], keypoints["radius_major"].astype(np.float64)])
-        rng = stream(self.seed, scene, SUITE_EFFECT)
-        size = (self.camera.width_px, self.camera.height_px)
-        effects = [climb(rng, name, levels[step], size, discs) for name, levels in condition.effects]
-        return Shot(condition.name, condition.rungs[step], scene, board, pose, look, effects, keypoints)
+        rng, size_px = stream(self.seed, scene_id, SUITE_EFFECT), (self.camera.width_px, self.camera.height_px)
+        discs = discs_of(keypoints)
+        effects = [draw_effect(rng, name, levels[step], size_px, discs) for name, levels in condition.effects]
+        return View(condition.name, condition.rungs[step], scene_id, board, pose, appearance, effects, keypoints)
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
-        """Image ``index``, and the broken background files met on the way."""
-        shot = self.shot(index)
-        background = self._background(shot.scene)
-        clean = render_board(background.image, self.camera, shot.pose, shot.board, shot.look)
-        image = apply(clean.image, stream(self.seed, shot.scene, SUITE_FIELD), shot.effects)
-        keypoints = clean.keypoints
-        keypoints["visible"] *= share_open(image, shot.effects, clean.masks)
-        keypoints["contrast"] = measure_contrast(image, clean.masks)
-        sample = Sample(index, image, keypoints, shot.effects, background.file, shot.condition, shot.rung, shot.scene)
-        return sample, background.broken
+        """Make one image. The result is a function of the config, the index and the background files.
 
-    def _background(self, scene: int) -> Background:
-        """The background of a scene; as many as a shard holds are kept, as every scene comes back under each rung."""
-        if scene in self._kept:
-            return self._kept[scene]
-        rng, (width, height) = stream(self.seed, scene, SUITE_BACKGROUND), (self.camera.width_px, self.camera.height_px)
+        Parameters
+        ----------
+        index : int
+            0 to n − 1.
+
+        Returns
+        -------
+        sample : Sample
+        broken_files : tuple of str
+            Background files that were drawn and could not be decoded.
+        """
+        view = self.view(index)
+        background = self._find_background(view.scene_id)
+        clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)
+        scene = degrade_scene(clean, stream(self.seed, view.scene_id, SUITE_FIELD), view.effects)
+        sample = Sample(
+            index,
+            scene.image,
+            scene.keypoints,
+            view.effects,
+            background.file,
+            condition=view.condition,
+            rung=view.rung,
+            scene_id=view.scene_id,
+        )
+        return sample, background.broken_files
+
+    def _find_background(self, scene_id: int) -> Background:
+        """Return the background of a scene from the cache, or make it.
+
+        The cache holds as many backgrounds as a shard has images, because every scene returns under each rung.
+        """
+        if scene_id in self._background_cache:
+            return self._background_cache[scene_id]
+        rng = stream(self.seed, scene_id, SUITE_BACKGROUND)
+        width, height = self.camera.width_px, self.camera.height_px
         if self.photos is None:
-            background = Background(procedural(rng, width, height))
+            background = Background(procedural_background(rng, width, height))
         else:
             background = self.photos.sample(rng, width, height, 1)
-        if len(self._kept) >= self.shard_size:
-            del self._kept[next(iter(self._kept))]
-        self._kept[scene] = background
+        if len(self._background_cache) >= self.shard_size:
+            del self._background_cache[next(iter(self._background_cache))]
+        self._background_cache[scene_id] = background
         return background
 
 
-def _listed(condition: Condition) -> dict[str, Any]:
-    """A condition for the config; effects as a list, because their order counts."""
+def _describe_condition(condition: Condition) -> dict[str, Any]:
+    """Return a condition for the config; its effects are a list, because their order counts."""
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]
     return {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
 
 
 def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
-    """The board that a suite's images show, from its dataset's config.
+    """Return the board that the images of a suite show, and their camera.
+
+    Parameters
+    ----------
+    config : mapping
+        The ``config`` of the dataset.
 
     Returns
     -------
-    points_mm : ndarray of shape (K, 3)
-        Its keypoints with z = 0, in the order of the truth.
+    points_mm : ndarray of shape (n, 3)
+        The board's keypoints with z = 0, in the order of the truth.
     camera : Camera
-        None in the place of both if the dataset is of no suite.
+
+    In place of both, None is returned if the dataset is of no suite.
+
+    Examples
+    --------
+    >>> from kpbench import SuiteConfig, load_suite
+    >>> from kpbench.synth import board_in_view
+    >>> points_mm, camera = board_in_view(SuiteConfig(load_suite("paper-v1")).to_dict())
+    >>> points_mm.shape, camera.width_px
+    ((6, 3), 1624)
     """
     if config.get("kind") != "suite":
         return None
@@ -249,4 +351,5 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
     camera = Camera(width, height, config["focal_px"], (k1, k2, p1, p2, k3))
     if "board" in config:
         return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
-    return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera  # the same places whatever the patch
+    # the keypoints of a hexagon board are at the same places for every patch
+    return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera

@@ -1,4 +1,4 @@
-"""Suites as TOML files: which conditions, which rungs, which scenes."""
+"""Suites as TOML files: the camera, the ranges of the scenes, and the conditions with their rungs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from kpbench.patches.board import find_patch
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.toml import TomlTable, name_source, read_toml
 
-SCHEMA = "kpbench.suite/1"
+SUITE_SCHEMA = "kpbench.suite/1"
 SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition")
 CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects")
-SCENE_KEYS = {  # least and most that a suite may ask for
+SCENE_KEYS = {
     "area_percent": (0.01, 90.0),
     "pitch_deg": (-80.0, 80.0),
     "yaw_deg": (-80.0, 80.0),
@@ -31,14 +31,36 @@ SCENE_KEYS = {  # least and most that a suite may ask for
     "slope_y": (-1.0, 1.0),
     "shadow": (0.0, 1.0),
 }
+"""Quantities that are drawn for a scene, and the least and most that a suite may ask for.
 
+The pose is that of :func:`kpbench.render.pose_board`, inks and light are those of :class:`kpbench.render.Appearance`.
+"""
 
 Levels = tuple[tuple[str, tuple[float, ...]], ...]
+"""Names, each with one value per rung."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One experiment: ``pose`` and ``effects`` list, by name, a value for each rung; effects are in order."""
+    """One experiment of a suite.
+
+    Attributes
+    ----------
+    name, unit : str
+    rungs : tuple of float
+        From mild to severe, in ``unit``.
+    pose : tuple of (str, tuple of float)
+        Quantities of the scene that the condition sets, each with one value per rung.
+    effects : tuple of (str, tuple of float)
+        Effects in the order in which they are applied, each with one level per rung.
+
+    Examples
+    --------
+    >>> from kpbench import load_suite
+    >>> blur = load_suite("paper-v1").conditions[2]
+    >>> blur.rungs, blur.effects
+    ((3.0, 7.0, 11.0, 15.0), (('blur', (3.0, 7.0, 11.0, 15.0)),))
+    """
 
     name: str
     unit: str
@@ -49,7 +71,31 @@ class Condition:
 
 @dataclass(frozen=True)
 class Suite:
-    """A suite as its file gives it; ``scene`` holds (least, most) of everything that is drawn for a scene."""
+    """The content of a suite's file.
+
+    Attributes
+    ----------
+    name : str
+    images : int
+        Number of base scenes.
+    patches : tuple of Patch
+    size_px : (int, int)
+        Width and height of the camera's images.
+    lens_mm : float
+        Focal length.
+    pixel_um : float
+        Side of a pixel.
+    scene : tuple of (str, (float, float))
+        Least and most of each quantity that is drawn for a scene, see :data:`SCENE_KEYS`.
+    conditions : tuple of Condition
+
+    Examples
+    --------
+    >>> from kpbench import load_suite
+    >>> camera = load_suite("paper-v1").camera((812, 620))
+    >>> round(camera.focal_px)
+    444
+    """
 
     name: str
     images: int
@@ -61,7 +107,15 @@ class Suite:
     conditions: tuple[Condition, ...]
 
     def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
-        """The camera at another image size with the same horizontal field of view."""
+        """Return the camera, at another image size with the same horizontal field of view if one is given.
+
+        Parameters
+        ----------
+        size_px : (int, int), optional
+            Width and height.
+        distortion : tuple of float
+            Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; the others are 0.
+        """
         width, height = size_px or self.size_px
         focal_px = self.lens_mm / (self.pixel_um / 1000) * width / self.size_px[0]
         k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
@@ -69,17 +123,36 @@ class Suite:
 
 
 def shipped_suites() -> dict[str, Path]:
-    """The suites that ship with kpbench: name to file."""
+    """Return the files of the suites that ship with kpbench, by the suites' names.
+
+    Examples
+    --------
+    >>> from kpbench.synth import shipped_suites
+    >>> list(shipped_suites())
+    ['extended-v1', 'paper-v1']
+    """
     return {path.stem: path for path in sorted(shipped_folder("suites").glob("*.toml"))}
 
 
 def load_suite(name: str) -> Suite:
-    """Read a suite: a shipped one by its name, or any by the path of its TOML file.
+    """Read a suite.
+
+    Parameters
+    ----------
+    name : str
+        Name of a shipped suite, or path of a TOML file.
 
     Raises
     ------
     DataError
-        If there is none, or one line that names the file, the key and what was expected.
+        If there is no such suite, or a value in its file is wrong. The message names the file, the key and the
+        expected value.
+
+    Examples
+    --------
+    >>> from kpbench import load_suite
+    >>> [condition.name for condition in load_suite("paper-v1").conditions]
+    ['scale', 'pitch', 'blur', 'dimming', 'noise']
     """
     shipped = shipped_suites()
     path = shipped.get(name, Path(name))
@@ -91,7 +164,7 @@ def load_suite(name: str) -> Suite:
 
 
 def _parse_suite(table: TomlTable) -> Suite:
-    table.require_schema(SCHEMA)
+    table.require_schema(SUITE_SCHEMA)
     camera = table.table("camera", ("size_px", "lens_mm", "pixel_um"))
     scene = table.table("scene", SCENE_KEYS)
     table.entries("condition", "a list of tables")

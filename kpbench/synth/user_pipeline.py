@@ -1,9 +1,9 @@
-"""A user's own albumentations pipeline, applied to a scene with its truth carried along.
+"""The user's own albumentations pipeline, applied to a scene with its truth carried along.
 
-The library can move keypoints itself, but not to this toolkit's accuracy: its resizing transforms are off by half
-a pixel times the change of scale, and its distortions lose points. So the coordinates of all pixels go through the
-pipeline as a mask, resampled as the image is, and a homography fitted to where the pixels of a disc came from
-carries the whole patch.
+Albumentations can move keypoints itself, but not as accurately as kpbench needs: its resizing transforms are off
+by half a pixel times the change of scale, and its distortions lose points. Instead, the coordinates of all pixels
+go through the pipeline as a mask, which is resampled like the image. A homography, fitted to the coordinates
+within a disc, then moves the whole patch.
 """
 
 from __future__ import annotations
@@ -19,61 +19,80 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.degrade.weather import albumentations
+from kpbench.degrade.weather import import_albumentations
 from kpbench.errors import DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project
-from kpbench.render.scene import Placement
+from kpbench.render.placement import Placement
 from kpbench.types import UInt8
 
-WHOLE = 0.999
-"""Least share of a pixel that came from the image and not from what a transform filled in."""
-LEAST_PIXELS = 12
-"""Of a disc, below which it counts as gone."""
+LEAST_IMAGE_SHARE = 0.999
+"""Least fraction of a pixel that must come from the image; a transform may fill in the rest."""
+LEAST_DISC_PIXELS = 12
+"""Fewest pixels of a disc to which a homography is fitted; with fewer, the patch has left the image."""
 
 
 def load_augmentation(path: str | Path) -> str:
-    """The pipeline in a file that ``albumentations.save`` wrote, JSON or YAML, as canonical JSON.
+    """Read a pipeline from a file that ``albumentations.save`` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file of JSON, or of YAML if its name ends in .yaml or .yml.
+
+    Returns
+    -------
+    str
+        The pipeline as canonical JSON, for :class:`SynthConfig`.
 
     Raises
     ------
     DataError
         If the file cannot be read, or holds no pipeline that the installed albumentations can build.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from kpbench.synth import load_augmentation
+    >>> text = '{"transform": {"__class_fullname__": "Rotate", "limit": [-20, 20], "p": 1.0}}'
+    >>> _ = Path("pipeline.json").write_text(text)
+    >>> load_augmentation("pipeline.json") == text
+    True
     """
     text = read_text(path, DataError)
     try:
-        content = _yaml(text) if Path(path).suffix.lower() in (".yaml", ".yml") else json.loads(text)
+        content = _parse_yaml(text) if Path(path).suffix.lower() in (".yaml", ".yml") else json.loads(text)
         canonical = json.dumps(content, sort_keys=True)
-        _pipeline(canonical)
-    except Exception as error:  # whatever a parser or a transform's own checks raise
-        said = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        raise DataError(f"{path}: no pipeline as albumentations.save writes it ({said})") from None
+        _build_pipeline(canonical)
+    except Exception as error:  # a parser or a transform's own checks may raise anything
+        problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
+        raise DataError(f"{path}: no pipeline as albumentations.save writes it ({problem})") from None
     return canonical
 
 
-def _yaml(text: str) -> Any:
-    import yaml  # type: ignore[import-untyped]  # albumentations brings it
+def _parse_yaml(text: str) -> Any:
+    import yaml  # type: ignore[import-untyped]  # albumentations requires it
 
     return yaml.safe_load(text)
 
 
 @lru_cache(maxsize=4)
-def _pipeline(canonical: str) -> Any:
-    A = albumentations()
-    built = A.Compose([A.from_dict(json.loads(canonical))])
-    _interpolate_masks(built)
-    return built
+def _build_pipeline(canonical: str) -> Any:
+    library = import_albumentations()
+    pipeline = library.Compose([library.from_dict(json.loads(canonical))])
+    _interpolate_masks(pipeline)
+    return pipeline
 
 
 def _interpolate_masks(transform: Any) -> None:
-    """Have a pipeline resample masks as it does images; it takes the nearest pixel otherwise."""
+    """Make a pipeline resample masks like images; its default is the nearest pixel."""
     for part in getattr(transform, "transforms", ()):
         _interpolate_masks(part)
     if hasattr(transform, "mask_interpolation"):
         transform.mask_interpolation = cv2.INTER_LINEAR
 
 
-def augment(
+def run_pipeline(
     image: UInt8, placements: Sequence[Placement], pipeline: str, seed: int
 ) -> tuple[UInt8, list[Placement | None]]:
     """Send a scene through a pipeline.
@@ -81,72 +100,90 @@ def augment(
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
-    placements : the patches in it.
-    pipeline : as :func:`load_augmentation` gives it.
-    seed : of all that the pipeline draws.
+    placements : sequence of Placement
+        The patches in the image.
+    pipeline : str
+        From :func:`load_augmentation`.
+    seed : int
+        Seed of all that the pipeline draws.
 
     Returns
     -------
     image : ndarray of the same shape, uint8
-    placements : at their new poses; None where the centre is no longer in the image.
+    placements : list of (Placement or None)
+        The same patches at their new poses; None if the patch's centre has left the image.
 
     Raises
     ------
     DataError
-        If a transform raises, gives an image of another shape or type, or mirrors a patch, which makes it another
+        If a transform fails, changes the shape or type of the image, or mirrors a patch. A mirrored patch is another
         design.
     """
-    transform, origin = _pipeline(pipeline), _origin(image.shape[0], image.shape[1])
+    transform, coordinates = _build_pipeline(pipeline), _pixel_coordinates(image.shape[0], image.shape[1])
     transform.set_random_seed(seed)
     try:
-        done = transform(image=image, mask=origin)
-    except Exception as error:  # whatever a transform raises
-        said = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        hint = "; some transforms work with --channels 3 only" if image.ndim == 2 else ""
-        raise DataError(f"--augment: {said}{hint}") from None
-    result, came_from = np.ascontiguousarray(done["image"]), done["mask"]
+        output = transform(image=image, mask=coordinates)
+    except Exception as error:  # a transform may raise anything
+        problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        hint = "; some transforms work with `channels=3` only" if image.ndim == 2 else ""
+        raise DataError(f"`augmentation`: {problem}{hint}") from None
+    result, source_px = np.ascontiguousarray(output["image"]), output["mask"]
     if result.shape != image.shape or result.dtype != np.uint8:
-        given, asked = (f"{'x'.join(map(str, a.shape[1::-1]))} {a.dtype}" for a in (result, image))
-        raise DataError(f"--augment: makes {given} of {asked}; end the pipeline with a resize or crop to that size")
-    if np.array_equal(came_from, origin):
+        given, expected = (f"{'x'.join(map(str, a.shape[1::-1]))} {a.dtype}" for a in (result, image))
+        raise DataError(
+            f"`augmentation`: makes {given} of {expected}; end the pipeline with a resize or crop to that size"
+        )
+    if np.array_equal(source_px, coordinates):
         return result, list(placements)
-    return result, [_carried(placement, came_from) for placement in placements]
+    return result, [_move_placement(placement, source_px) for placement in placements]
 
 
 @lru_cache(maxsize=2)
-def _origin(height: int, width: int) -> NDArray[np.float32]:
-    """Where each pixel is, in px, and a one to tell it from what a transform fills in: (H, W, 3)."""
+def _pixel_coordinates(height: int, width: int) -> NDArray[np.float32]:
+    """Return x and y of each pixel (px), and a 1 that marks the pixel as the image's own: shape (H, W, 3)."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
-def _carried(placement: Placement, came_from: NDArray[np.float32]) -> Placement | None:
-    """A patch after the move that took each pixel of an image from where ``came_from`` says; None if it has gone."""
+def _move_placement(placement: Placement, source_px: NDArray[np.float32]) -> Placement | None:
+    """Move a patch with the pixels of its image.
+
+    Parameters
+    ----------
+    placement : Placement
+    source_px : ndarray of shape (H, W, 3), float32
+        :func:`_pixel_coordinates` after the move: where the content of each pixel was before.
+
+    Returns
+    -------
+    Placement or None
+        None if the patch's centre has left the image.
+    """
     H = placement.H_patch2image
-    to_patch = np.linalg.inv(H)
-    u, v, w = np.moveaxis(came_from @ to_patch.T.astype(np.float32), -1, 0)
-    on_disc = (u * u + v * v <= w * w) & (came_from[..., 2] > WHOLE) & (w > 0)
+    H_image2patch = np.linalg.inv(H)
+    u, v, w = np.moveaxis(source_px @ H_image2patch.T.astype(np.float32), -1, 0)
+    on_disc = (u * u + v * v <= w * w) & (source_px[..., 2] > LEAST_IMAGE_SHARE) & (w > 0)
     rows, columns = np.nonzero(on_disc)
-    if len(rows) < LEAST_PIXELS:
+    if len(rows) < LEAST_DISC_PIXELS:
         return None
-    here, there = np.column_stack([columns, rows]).astype(np.float64), came_from[rows, columns, :2].astype(np.float64)
-    middle = here.mean(axis=0)  # fitted from here, which is well conditioned
-    fitted = cv2.findHomography(there - H[:2, 2], here - middle, 0)[0]
-    if fitted is None:
+    after, before = np.column_stack([columns, rows]).astype(np.float64), source_px[rows, columns, :2].astype(np.float64)
+    middle = after.mean(axis=0)  # both sets of points are centred, which conditions the fit well
+    fit = cv2.findHomography(before - H[:2, 2], after - middle, 0)[0]
+    if fit is None:
         return None
-    found = np.asarray(fitted, np.float64)
-    if np.linalg.det(found[:2, :2]) < 0:
+    H_move = np.asarray(fit, np.float64)
+    if np.linalg.det(H_move[:2, :2]) < 0:
         raise DataError(
-            "--augment: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
+            "`augmentation`: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
         )
-    # where the move is no homography, the centre counts
-    inner = np.argsort((u * u + v * v)[rows, columns] / (w * w)[rows, columns])[:LEAST_PIXELS]
-    left = (here[inner] - middle - project(found, there[inner] - H[:2, 2])).mean(axis=0)
-    before, after = np.eye(3), np.eye(3)
-    before[:2, 2], after[:2, 2] = -H[:2, 2], middle + left
-    pose = after @ found @ before @ H
+    # where the move is no homography, the pixels nearest to the patch's centre decide where the centre goes
+    innermost = np.argsort((u * u + v * v)[rows, columns] / (w * w)[rows, columns])[:LEAST_DISC_PIXELS]
+    residual = (after[innermost] - middle - project(H_move, before[innermost] - H[:2, 2])).mean(axis=0)
+    to_patch_centre, from_middle = np.eye(3), np.eye(3)
+    to_patch_centre[:2, 2], from_middle[:2, 2] = -H[:2, 2], middle + residual
+    pose = from_middle @ H_move @ to_patch_centre @ H
     pose = pose / pose[2, 2]
-    height, width = came_from.shape[:2]
+    height, width = source_px.shape[:2]
     x, y = pose[:2, 2]
     if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5):
         return None

@@ -15,12 +15,13 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kpbench.degrade.ladder import paper_mix
+from kpbench.degrade.ladder import apply_effects, draw_paper_mix
 from kpbench.errors import DataError
 from kpbench.images import decode_photo
 from kpbench.patches.design import Patch
-from kpbench.render.background import PhotoFolder, procedural
-from kpbench.render.scene import Limits, random_placements, render_scene
+from kpbench.render.background import PhotoFolder, procedural_background
+from kpbench.render.placement import Limits, random_placements
+from kpbench.render.scene import render_scene
 from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
 from kpbench.types import Float32, UInt8
 from kpbench.workers import run_in_order
@@ -84,7 +85,7 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
         return count == 1 or (n % VALIDATION_EVERY == 0) == (part == "validation")
 
     if folder is None:
-        return [procedural(np.random.default_rng([2410, n]), 640, 480) for n in range(64) if kept(n, 64)]
+        return [procedural_background(np.random.default_rng([2410, n]), 640, 480) for n in range(64) if kept(n, 64)]
     photos = PhotoFolder.open(folder)
     files = [name for n, name in enumerate(photos.files) if kept(n, len(photos.files))]
     read = (decode_photo(photos.path / name, 1) for name in files)
@@ -198,7 +199,7 @@ def _scenes(
         fixed = np.random.default_rng([seed, 1, (first + n) % config.set_size])
         background = window(photos[int(fixed.integers(len(photos)))], fixed, width, height)
         rendered = render_scene(background, random_placements(fixed, width, height, patches, Limits()))
-        image = paper_mix(rendered.image, rng)[0] if rng.random() < severity else rendered.image
+        image = apply_effects(rendered.image, rng, draw_paper_mix(rng)) if rng.random() < severity else rendered.image
         images[n] = image
         for k, row in enumerate(rendered.keypoints[:MOST_KEYPOINTS]):
             keypoints[n, k] = row["x"], row["y"], [p.patch_id for p in patches].index(row["patch_id"]), 0.0

@@ -5,7 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kpbench.degrade.effects import BORDER, box_taps, jpeg, line_kernel
+from kpbench.degrade.blurs import BORDER_MODE, box_taps, line_kernel
+from kpbench.degrade.effects import jpeg
 from kpbench.types import Float32, UInt8
 
 
@@ -95,7 +96,7 @@ def _rain(work: Float32, rng: np.random.Generator) -> Float32:
     lines = np.rint(np.stack([start, start + step], axis=1)).astype(np.int32)
     streaked = cv2.polylines(work, list(lines), False, rng.uniform(160, 230))
     reach = int(rng.choice([1, 3, 5, 7]))
-    return np.asarray(cv2.blur(streaked, (reach, reach), borderType=BORDER), np.float32)
+    return np.asarray(cv2.blur(streaked, (reach, reach), borderType=BORDER_MODE), np.float32)
 
 
 def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
@@ -113,4 +114,4 @@ def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: fl
         kernel = disc / disc.sum()
     else:
         kernel = np.outer(taps := box_taps(width), taps)
-    return np.asarray(cv2.filter2D(work, -1, kernel, borderType=BORDER), np.float32), width
+    return np.asarray(cv2.filter2D(work, -1, kernel, borderType=BORDER_MODE), np.float32), width

@@ -18,7 +18,8 @@ from kpbench.geometry.homography import project_discs
 from kpbench.images import resize
 from kpbench.patches.design import Patch
 from kpbench.render.lookalikes import draw_lookalikes
-from kpbench.render.scene import Limits, Placement, paint, random_poses, rasterise
+from kpbench.render.placement import Limits, Placement, random_poses
+from kpbench.render.scene import paint_patch, rasterise_patches
 from kpbench.training.crop_effects import degrade_crop
 from kpbench.types import Float, Float32, UInt8
 
@@ -220,6 +221,6 @@ def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> No
     """Draw the patches of a whole batch with one call of the rasteriser."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
     # edges true to 1/64 px: cheaper than in a benchmark image, and still below what noise leaves
-    masks = rasterise([placement for _, placement in drawn], 1 / 64)
+    masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
-        paint(image, mask, placement.black, placement.white)
+        paint_patch(image, mask, placement.black, placement.white)

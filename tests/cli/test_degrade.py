@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from helpers import digests, kpbench
 
-from kpbench.degrade.effects import blur
+from kpbench.degrade.blurs import blur
 from kpbench.degrade.ladder import LADDER
 
 

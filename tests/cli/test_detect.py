@@ -17,7 +17,7 @@ from kpbench.errors import DataError
 from kpbench.images import ImageSource, image_writer
 from kpbench.patches.design import load_patches
 from kpbench.predictions.files import read_predictions
-from kpbench.render.scene import Limits
+from kpbench.render.placement import Limits
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.types import Detections
 

@@ -2,7 +2,7 @@ import numpy as np
 
 from kpbench.dataset.card import facts, histograms, write_card
 from kpbench.dataset.generation import generate
-from kpbench.render.scene import Limits
+from kpbench.render.placement import Limits
 from kpbench.synth.synthetic import SynthConfig
 
 

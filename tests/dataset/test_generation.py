@@ -17,8 +17,9 @@ from kpbench.dataset.folder import open_dataset
 from kpbench.dataset.generation import generate, generate_part, merge
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Limits, Placement, rasterise
-from kpbench.synth.finish import share_open
+from kpbench.render.placement import Limits, Placement
+from kpbench.render.scene import rasterise_patches
+from kpbench.synth.finish import unoccluded_fraction
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.synth.user_pipeline import load_augmentation
 from kpbench.workers import dask_executor
@@ -106,11 +107,11 @@ def test_occlusion_of_the_ladder_lowers_what_is_visible():
 def test_what_an_occlusion_hides_outside_the_image_counts_for_nothing(photos):
     sample = config(photos, limits=Limits(count=(9, 9), radius_px=(20, 30))).make(0)[0]
     placements = [Placement(shipped_patches()[0], np.array([[20.0, 0, 0], [0, 20, 60], [0, 0, 1]]), 0.0, 255.0)]
-    masks = tuple(rasterise(placements))
+    masks = tuple(rasterise_patches(placements))
     effects = [{"effect": "occlusion", "strips": [[-21.0, 60.0, 40.0, 100.0, 0.0, 90.0]]}]  # its end is at x = -1
-    assert share_open(sample.image, effects, masks)[0] == pytest.approx(1)
+    assert unoccluded_fraction(sample.image, effects, masks)[0] == pytest.approx(1)
     effects[0]["strips"][0][0] = 20.0
-    assert share_open(sample.image, effects, masks)[0] < 0.05
+    assert unoccluded_fraction(sample.image, effects, masks)[0] < 0.05
 
 
 def test_a_pipeline_keeps_what_an_occlusion_hid(photos, tmp_path):
@@ -135,7 +136,7 @@ def test_radii_are_kept_and_small_ones_asked_for(photos):
     assert keypoints["radius_major"].max() < 13
     assert Limits.of_radius(5, 80) == Limits()
     for bad in ((80, 5), (3, 3), (0, 9), (float("nan"), 9), (5, 1e9)):
-        with pytest.raises(DataError, match="--radius-px is"):
+        with pytest.raises(DataError, match="`radius_px` is"):
             Limits.of_radius(*bad)
 
 
@@ -191,13 +192,13 @@ def test_a_disk_too_small_is_told_before_the_start(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"n": 0}, "--n is 0"),
-        ({"n": -5}, "--n is -5"),
-        ({"size_px": (10, 480)}, "--size is 10x480"),
-        ({"channels": 2}, "--channels is 2"),
-        ({"shard_size": 0}, "--shard-size is 0"),
-        ({"seed": -1}, "--seed is -1"),
-        ({"deteriorate": "much"}, "--deteriorate is 'much'"),
+        ({"n": 0}, "`n` is 0"),
+        ({"n": -5}, "`n` is -5"),
+        ({"size_px": (10, 480)}, "`size_px` is 10x480"),
+        ({"channels": 2}, "`channels` is 2"),
+        ({"shard_size": 0}, "`shard_size` is 0"),
+        ({"seed": -1}, "`seed` is -1"),
+        ({"deteriorate": "much"}, "`deteriorate` is 'much'"),
     ],
 )
 def test_a_value_out_of_range_is_one_line(changes, says):

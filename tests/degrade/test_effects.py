@@ -3,8 +3,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kpbench.degrade.effects import blur, box_taps, dimming, line_kernel, motion_blur, noise
-from kpbench.degrade.ladder import FUNCTIONS, LADDER_MIX, apply, climb, ladder_mix, paper_mix
+from kpbench.degrade.blurs import blur, box_taps, line_kernel, motion_blur
+from kpbench.degrade.effects import dimming, noise
+from kpbench.degrade.ladder import (
+    EFFECT_FUNCTIONS,
+    LADDER_MIX,
+    apply_effects,
+    draw_effect,
+    draw_ladder_mix,
+    draw_paper_mix,
+)
 from kpbench.degrade.weather import _transform, rain, shadow
 
 
@@ -12,6 +20,11 @@ def picture(channels=1):
     rng = np.random.default_rng(0)
     shape = (60, 80) if channels == 1 else (60, 80, 3)
     return rng.integers(30, 220, shape, dtype=np.uint8)
+
+
+def apply_mix(image, seed):
+    rng = np.random.default_rng(seed)
+    return apply_effects(image, rng, draw_paper_mix(rng))
 
 
 @given(st.floats(1, 31))
@@ -51,7 +64,7 @@ def test_a_motion_kernel_has_the_length_and_direction_asked_for():
         lambda image: noise(image, np.random.default_rng(1), 20),
         lambda image: shadow(image, 5),
         lambda image: rain(image, 5),
-        lambda image: paper_mix(image, np.random.default_rng(4))[0],
+        lambda image: apply_mix(image, 4),
     ],
 )
 def test_effects_keep_shape_and_input_and_repeat(effect, channels):
@@ -88,13 +101,14 @@ def test_the_paper_mix_records_what_it_did():
     image = picture()
     seen = set()
     for seed in range(60):
-        result, effects = paper_mix(image, np.random.default_rng(seed))
+        effects = draw_paper_mix(np.random.default_rng(seed))
+        result = apply_mix(image, seed)
         assert 1 <= len(effects) <= 3
         names = [entry["effect"] for entry in effects]
-        assert names == sorted(names, key=list(FUNCTIONS).index)
+        assert names == sorted(names, key=list(EFFECT_FUNCTIONS).index)
         seen.update(names)
         if "noise" not in names:
-            assert (apply(image, np.random.default_rng(0), effects) == result).all()
+            assert (apply_effects(image, np.random.default_rng(0), effects) == result).all()
     assert seen == {"shadow", "rain", "motion_blur", "blur", "brightness", "noise"}
 
 
@@ -102,13 +116,15 @@ def test_the_ladder_mix_climbs_to_the_severest_rung_and_records_it():
     image, discs = picture(), np.array([[60.0, 50.0, 14.0]])
     levels: dict[str, list[float]] = {}
     for seed in range(400):
-        result, effects = ladder_mix(image, np.random.default_rng(seed), discs)
+        rng = np.random.default_rng(seed)
+        effects = draw_ladder_mix(rng, (80, 60), discs)
+        result = apply_effects(image, rng, effects)
         assert result.shape == image.shape
         assert 1 <= len(effects) <= 2
         for entry in effects:
             levels.setdefault(entry["effect"], []).append(next(v for v in entry.values() if not isinstance(v, str)))
         if not {"noise", "low_light"} & {entry["effect"] for entry in effects}:
-            assert (apply(image, np.random.default_rng(0), effects) == result).all()
+            assert (apply_effects(image, np.random.default_rng(0), effects) == result).all()
     assert levels.keys() == {name.replace("-", "_").replace("rain", "rainfall") for name in LADDER_MIX}
     for effect, severest in {"blur": 15, "noise": 60, "motion_blur": 30, "low_light": 9, "dimming": 40}.items():
         assert 0.7 * severest < max(levels[effect]) <= severest
@@ -126,4 +142,4 @@ def test_the_library_for_rain_and_shadow_never_looks_on_the_network(monkeypatch)
 
 
 def test_a_quality_between_two_is_recorded_as_the_one_applied():
-    assert climb(np.random.default_rng(0), "jpeg", 7.6, (20, 20))["quality"] == 8.0
+    assert draw_effect(np.random.default_rng(0), "jpeg", 7.6, (20, 20))["quality"] == 8.0

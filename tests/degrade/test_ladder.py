@@ -6,24 +6,20 @@ import cv2
 import numpy as np
 import pytest
 
+from kpbench.degrade.blurs import blur, box_taps, disc_kernel, gaussian_taps, line_kernel
 from kpbench.degrade.effects import (
-    blur,
-    box_taps,
-    disc_kernel,
     flare,
-    gaussian_taps,
-    line_kernel,
     low_light,
     noise,
     occlusion,
     occlusion_cover,
     shadow_edge,
 )
-from kpbench.degrade.ladder import FUNCTIONS, LADDER, apply, climb
+from kpbench.degrade.ladder import EFFECT_FUNCTIONS, LADDER, apply_effects, draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.coverage import rasterise
 
-RUNGS = [(effect, level) for effect, rungs in LADDER.items() for level in rungs.levels]
+RUNGS = [(effect, level) for effect, severity in LADDER.items() for level in severity.levels]
 BLURS = ("blur", "gaussian-blur", "motion-blur", "defocus")
 
 
@@ -56,14 +52,14 @@ def test_the_papers_rungs_are_the_papers():
 def test_a_recorded_effect_repeats_and_keeps_shape_and_input(effect, level, channels):
     image = picture(channels)
     before = image.copy()
-    recorded = climb(np.random.default_rng(3), effect, level, (160, 120))
-    results = [apply(image, np.random.default_rng(5), [recorded]) for _ in range(2)]
+    recorded = draw_effect(np.random.default_rng(3), effect, level, (160, 120))
+    results = [apply_effects(image, np.random.default_rng(5), [recorded]) for _ in range(2)]
     assert (results[0] == results[1]).all()
     assert results[0].dtype == np.uint8
     assert results[0].shape == image.shape
     assert (results[0] != image).any()
     assert (image == before).all()
-    assert climb(np.random.default_rng(3), effect, level, (160, 120)) == recorded
+    assert draw_effect(np.random.default_rng(3), effect, level, (160, 120)) == recorded
 
 
 @pytest.mark.parametrize("effect", sorted(set(LADDER) - {"dimming-literal"}))
@@ -71,7 +67,9 @@ def test_a_higher_rung_does_more(effect):
     image = picture(1)
     done = []
     for level in LADDER[effect].levels:
-        worn = apply(image, np.random.default_rng(5), [climb(np.random.default_rng(3), effect, level, (160, 120))])
+        worn = apply_effects(
+            image, np.random.default_rng(5), [draw_effect(np.random.default_rng(3), effect, level, (160, 120))]
+        )
         done.append(np.mean((worn.astype(float) - image) ** 2))
     assert (np.diff(done) > 0).all()
 
@@ -101,7 +99,7 @@ def test_a_defocused_point_is_a_disc_of_its_radius():
 def test_no_edge_appears_at_the_border(effect):
     flat = np.full((60, 80), 77, np.uint8)
     for level in LADDER[effect].levels:
-        assert (apply(flat, None, [climb(np.random.default_rng(1), effect, level, (80, 60))]) == 77).all()
+        assert (apply_effects(flat, None, [draw_effect(np.random.default_rng(1), effect, level, (80, 60))]) == 77).all()
 
 
 @pytest.mark.parametrize("effect", [e for e in LADDER if e not in ("noise", "low-light", "jpeg", "dimming-literal")])
@@ -112,7 +110,7 @@ def test_no_effect_moves_a_patch(measure, effect):
 
 def test_the_measurement_sees_a_shift(measure, monkeypatch):
     monkeypatch.setitem(
-        FUNCTIONS,
+        EFFECT_FUNCTIONS,
         "blur",
         lambda image, kernel_px: cv2.warpAffine(
             blur(image, kernel_px), np.array([[1, 0, 0.25], [0, 1, -0.125]]), image.shape[::-1], borderValue=200
@@ -161,7 +159,7 @@ def test_a_shadow_edge_takes_its_share_of_light_on_one_side():
 @pytest.mark.parametrize("level", [10, 25, 40])
 def test_occlusion_hides_the_share_it_says(level):
     discs = np.array([[50.3, 60.1, 20.0], [130.0, 60.0, 12.5]])
-    recorded = climb(np.random.default_rng(0), "occlusion", level, (180, 120), discs)
+    recorded = draw_effect(np.random.default_rng(0), "occlusion", level, (180, 120), discs)
     cover = occlusion_cover(recorded["strips"], (0, 0, 180, 120))
     angles = np.radians(np.arange(360))
     for x, y, radius in discs:
@@ -189,7 +187,9 @@ def test_flare_adds_light_and_takes_none():
 def test_a_dimmed_picture_by_the_printed_law_is_black():
     image = picture(1)
     rng = np.random.default_rng(0)
-    worn = [apply(image, rng, [climb(rng, "dimming-literal", k, (160, 120))]).max() for k in (10, 20, 30, 40)]
+    worn = [
+        apply_effects(image, rng, [draw_effect(rng, "dimming-literal", k, (160, 120))]).max() for k in (10, 20, 30, 40)
+    ]
     assert worn[0] <= 2
     assert worn[1:] == [0, 0, 0]
 
@@ -205,4 +205,4 @@ def test_a_dimmed_picture_by_the_printed_law_is_black():
 )
 def test_a_level_that_makes_no_sense_is_told(effect, level, says):
     with pytest.raises(DataError, match=says):
-        climb(np.random.default_rng(0), effect, level, (160, 120))
+        draw_effect(np.random.default_rng(0), effect, level, (160, 120))

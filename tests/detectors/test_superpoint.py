@@ -200,7 +200,7 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize("name", ["superpoint", "superpoint-small"])
 def test_the_shipped_weights_find_large_clean_patches(name):
     """An easy scene, in which a wrong file, frame or channel order is seen."""
-    from kpbench.render.scene import Limits
+    from kpbench.render.placement import Limits
     from kpbench.synth.synthetic import SynthConfig
 
     detect = load_detector(name)

@@ -3,14 +3,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench.degrade.effects import blur, dimming, motion_blur, noise
+from kpbench.degrade.blurs import blur, motion_blur
+from kpbench.degrade.effects import dimming, noise
 from kpbench.detectors.interface import load_detector
 from kpbench.detectors.template import TemplateDetector, crossings
 from kpbench.errors import DataError
 from kpbench.fitting.pyramid import pyramid, sample
 from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
-from kpbench.render.background import procedural
-from kpbench.render.scene import Placement, render_scene
+from kpbench.render.background import procedural_background
+from kpbench.render.placement import Placement
+from kpbench.render.scene import render_scene
 
 SIZE = (320, 240)
 # x, y, radius, tilt (short over long semi-axis), two turns: one patch of each design
@@ -39,7 +41,7 @@ def placements(poses=POSES, black=40.0, white=215.0):
 
 @pytest.fixture(scope="module")
 def rendered():
-    return render_scene(procedural(np.random.default_rng(3), *SIZE), placements())
+    return render_scene(procedural_background(np.random.default_rng(3), *SIZE), placements())
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +99,9 @@ def test_colour_is_read_as_grey(rendered, detector):
 
 
 def test_a_patch_that_is_cut_by_the_image_is_found(detector):
-    cut = render_scene(procedural(np.random.default_rng(4), *SIZE), placements([(8.0, 120.4, 22.0, 1.0, 20, 0)]))
+    cut = render_scene(
+        procedural_background(np.random.default_rng(4), *SIZE), placements([(8.0, 120.4, 22.0, 1.0, 20, 0)])
+    )
     assert cut.keypoints["visible"][0] < 0.75
     found = detector(cut.image)
     nearest, distance = pair(found, cut.keypoints)
@@ -146,7 +150,7 @@ def test_the_designs_are_not_written_into_the_code():
 
 
 def test_more_poses_than_remap_takes_at_once_are_sampled():
-    levels = pyramid(procedural(np.random.default_rng(0), 64, 48), 0)
+    levels = pyramid(procedural_background(np.random.default_rng(0), 64, 48), 0)
     xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
     values = sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
     assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()
@@ -159,6 +163,6 @@ def test_a_design_whose_centre_looks_the_same_after_half_a_turn_is_found_in_ever
     for angle in range(10, 370, 30):
         H = np.eye(3)
         H[:2, :2], H[:2, 2] = 25 * turn(angle), (60.2, 58.7)
-        background = procedural(np.random.default_rng(1), 120, 120)
+        background = procedural_background(np.random.default_rng(1), 120, 120)
         found = find(render_scene(background, [Placement(patch, H, 40.0, 215.0)]).image)
         assert np.hypot(*(found.xy - (60.2, 58.7)).T).min(initial=9) < 0.05, angle

@@ -5,7 +5,8 @@ import pytest
 
 from kpbench.detectors import verification as verify
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Placement, render_scene
+from kpbench.render.placement import Placement
+from kpbench.render.scene import render_scene
 
 PATCHES = shipped_patches()
 SURE = 0.9

@@ -10,7 +10,8 @@ from kpbench.fitting.pyramid import pyramid
 from kpbench.fitting.templates import LOOKUP_HALF, VIEW_PX, bank
 from kpbench.fitting.views import blurred, rectify
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Placement, render_scene
+from kpbench.render.placement import Placement
+from kpbench.render.scene import render_scene
 
 PATCHES = shipped_patches()
 KNOWN = bank(PATCHES)

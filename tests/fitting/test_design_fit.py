@@ -3,12 +3,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kpbench.degrade.effects import blur, noise
+from kpbench.degrade.blurs import blur
+from kpbench.degrade.effects import noise
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting.pyramid import pyramid
 from kpbench.patches.design import shipped_patches
-from kpbench.render.background import procedural
-from kpbench.render.scene import Placement, render_scene
+from kpbench.render.background import procedural_background
+from kpbench.render.placement import Placement
+from kpbench.render.scene import render_scene
 
 PATCHES = shipped_patches()
 
@@ -87,7 +89,7 @@ def test_a_patch_at_the_border_is_fitted_on_what_is_there():
 
 def test_a_wide_surround_on_any_texture_keeps_the_model_before_the_camera():
     rng, wide = np.random.default_rng(1), replace(PATCHES[0], rim=0.5, quiet_zone=1.5)
-    levels = pyramid(procedural(rng, 320, 240), 0)
+    levels = pyramid(procedural_background(rng, 320, 240), 0)
     xy, scale, angle = rng.uniform(60, 180, (40, 2)), rng.uniform(20, 60, 40), rng.uniform(0, 360, 40)
     A = np.array([size * turn(deg) @ np.diag([1.0, 0.6]) for size, deg in zip(scale, angle, strict=True)])
     assert np.isfinite(refine.fit(levels, xy, A, [wide] * 40).xy).all()

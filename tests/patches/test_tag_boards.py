@@ -7,7 +7,8 @@ from kpbench.geometry.camera import Camera
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
-from kpbench.render.board_view import Look, board_keypoints, pose_board, render_board
+from kpbench.render.board_projection import pose_board
+from kpbench.render.board_view import Appearance, board_keypoints, render_board
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
 
@@ -37,7 +38,7 @@ def test_its_detector_finds_every_corner_where_the_truth_is(board, lens):
     off = []
     for n, pitch_deg in enumerate((0, 40, -30)):
         pose = pose_board(camera, board, 20, pitch_deg=pitch_deg, roll_deg=25 + 80 * n, shift=(0.05, -0.05))
-        image = render_board(SCENE, camera, pose, board, Look(30, 220, light=0.9, slope=(0.1, 0))).image
+        image = render_board(SCENE, camera, pose, board, Appearance(30, 220, light=0.9, slope=(0.1, 0))).image
         found = load_detector(board.name)(cv2.GaussianBlur(image, (0, 0), 0.7))
         truth = board_keypoints(camera, pose, board)
         order = [int(np.flatnonzero(found.patch_id == k["patch_id"])[0]) for k in truth]
@@ -57,14 +58,14 @@ def test_nothing_is_found_where_nothing_is(name):
 @pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.name)
 def test_its_light_is_that_of_its_modules(board):
     pose = pose_board(CAMERA, board, 15, pitch_deg=30, roll_deg=12)
-    image = render_board(np.zeros((480, 640), np.uint8), CAMERA, pose, board, Look(0, 200, edge=1)).image
+    image = render_board(np.zeros((480, 640), np.uint8), CAMERA, pose, board, Appearance(0, 200, edge=1)).image
     white = pose_board(CAMERA, board, 15, pitch_deg=30, roll_deg=12)
-    paper = render_board(np.zeros((480, 640), np.uint8), CAMERA, white, board, Look(200, 200, edge=1)).image
+    paper = render_board(np.zeros((480, 640), np.uint8), CAMERA, white, board, Appearance(200, 200, edge=1)).image
     tilted = 1 - image.sum() / paper.sum()
     assert np.isclose(tilted, board.black.mean(), rtol=0.15)  # what is nearer is larger
     flat = pose_board(CAMERA, board, 15, roll_deg=12)
     image, paper = (
-        render_board(np.zeros((480, 640), np.uint8), CAMERA, flat, board, Look(ink, 200, edge=1)).image
+        render_board(np.zeros((480, 640), np.uint8), CAMERA, flat, board, Appearance(ink, 200, edge=1)).image
         for ink in (0, 200)
     )
     assert np.isclose(1 - image.sum() / paper.sum(), board.black.mean(), rtol=0.003)
@@ -75,8 +76,8 @@ def test_a_suite_with_tags_shows_the_same_scenes():
     patches, tags = (SuiteConfig(suite, images=2, size_px=(203, 155), board=board) for board in (None, "aruco"))
     assert (patches.n, tags.n, tags.name) == (26 * 4 * 2, 26 * 2, "paper-v1-aruco")
     for rung, scene in ((3, 0), (9, 1), (20, 0)):
-        a, b = patches.shot((rung * 4 + 1) * 2 + scene), tags.shot(rung * 2 + scene)
-        assert (a.condition, a.rung, a.scene, a.look) == (b.condition, b.rung, b.scene, b.look)
+        a, b = patches.view((rung * 4 + 1) * 2 + scene), tags.view(rung * 2 + scene)
+        assert (a.condition, a.rung, a.scene_id, a.appearance) == (b.condition, b.rung, b.scene_id, b.appearance)
         assert (a.pose.t_camera == b.pose.t_camera).all()
         assert (a.pose.R_board2camera == b.pose.R_board2camera).all()
         assert a.effects == b.effects

@@ -7,7 +7,7 @@ from PIL import Image
 
 from kpbench.errors import DataError
 from kpbench.files import image_files
-from kpbench.render.background import PhotoFolder, procedural
+from kpbench.render.background import PhotoFolder, procedural_background
 
 
 def photo(width=120, height=90, seed=0):
@@ -39,7 +39,7 @@ def test_every_mode_gives_the_size_asked_for(folder):
             assert got.image.shape == shape
             assert got.image.dtype == np.uint8
             files.add(got.file)
-            broken.update(got.broken)
+            broken.update(got.broken_files)
     assert len(files) == 6
     assert broken == {"empty.jpg", "text.png"}
 
@@ -96,7 +96,7 @@ def test_procedural_backgrounds_have_a_natural_spectrum():
     """Amplitude falls about as 1/f, as that of photographs does, not flat as that of plain noise."""
     slopes = []
     for seed in range(4):
-        image = procedural(np.random.default_rng(seed), 256, 256).astype(float)
+        image = procedural_background(np.random.default_rng(seed), 256, 256).astype(float)
         window = np.hanning(256)[:, None] * np.hanning(256)
         power = np.abs(np.fft.fft2((image - image.mean()) * window)) ** 2
         frequency = np.hypot(np.fft.fftfreq(256)[:, None], np.fft.fftfreq(256))
@@ -107,7 +107,7 @@ def test_procedural_backgrounds_have_a_natural_spectrum():
 
 
 def test_procedural_backgrounds_differ_and_repeat():
-    one, same, other = (procedural(np.random.default_rng(seed), 96, 64, 3) for seed in (1, 1, 2))
+    one, same, other = (procedural_background(np.random.default_rng(seed), 96, 64, 3) for seed in (1, 1, 2))
     assert one.shape == (64, 96, 3)
     assert (one == same).all()
     assert (one != other).mean() > 0.5

@@ -10,16 +10,8 @@ from kpbench.geometry.camera import Camera, rotation_xyz
 from kpbench.geometry.homography import project
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.render.board_view import (
-    Look,
-    Pose,
-    board_keypoints,
-    outline_px,
-    polygon_area,
-    pose_board,
-    render_board,
-    to_px,
-)
+from kpbench.render.board_projection import Pose, polygon_area, pose_board, project_outline, project_to_image
+from kpbench.render.board_view import Appearance, board_keypoints, render_board
 
 BOARD = hexagon_board(shipped_patches()[0], 187.5)
 PAPER = Camera(1624, 1240, 4 / 0.0045)
@@ -91,7 +83,8 @@ def test_the_local_homography_follows_the_lens_to_first_order(lens):
     for axis in np.eye(2):
         at = np.array([BOARD.keypoints[0].x_mm, BOARD.keypoints[0].y_mm])
         moved = (
-            to_px(camera, placed, (at + step * axis)[None]) - to_px(camera, placed, (at - step * axis)[None])
+            project_to_image(camera, placed, (at + step * axis)[None])
+            - project_to_image(camera, placed, (at - step * axis)[None])
         ) / 2e-5
         found = (project(k["H_patch2image"], [1e-5 * axis]) - project(k["H_patch2image"], [-1e-5 * axis])) / 2e-5
         assert abs(moved - found).max() < 1e-4
@@ -105,7 +98,7 @@ def test_local_K_of_a_pinhole_is_K():
 @given(poses, lenses)
 def test_the_board_covers_what_was_asked_for_and_lies_in_the_image(pose, lens):
     camera = Camera(1624, 1240, PAPER.focal_px, lens)
-    edge = outline_px(camera, pose_board(camera, BOARD, **pose), BOARD)
+    edge = project_outline(camera, pose_board(camera, BOARD, **pose), BOARD)
     assert np.isclose(100 * polygon_area(edge) / (1624 * 1240), pose["area_percent"], rtol=1e-9)
     assert (edge > -0.5).all()
     assert (edge < (1623.5, 1239.5)).all()
@@ -115,7 +108,7 @@ def test_the_board_covers_what_was_asked_for_and_lies_in_the_image(pose, lens):
 def test_the_pixels_of_the_board_are_as_many_as_asked_for(area, pitch):
     placed = pose_board(PAPER, BOARD, area, pitch_deg=pitch, roll_deg=33, shift=(0.05, 0.02))
     scene = np.zeros((1240, 1624), np.uint8)
-    image = render_board(scene, PAPER, placed, BOARD, Look(255, 255, edge=1)).image
+    image = render_board(scene, PAPER, placed, BOARD, Appearance(255, 255, edge=1)).image
     assert np.isclose(100 * np.count_nonzero(image > 127) / image.size, area, rtol=0.01)
 
 
@@ -127,7 +120,7 @@ def test_a_patch_is_16_px_long_on_a_board_of_half_a_percent():
 def test_which_way_the_board_leans():
     near = {}
     for name, tilt in {"pitch": {"pitch_deg": 40}, "yaw": {"yaw_deg": 40}}.items():
-        edge = outline_px(PAPER, pose_board(PAPER, BOARD, 16, **tilt), BOARD)
+        edge = project_outline(PAPER, pose_board(PAPER, BOARD, 16, **tilt), BOARD)
         near[name] = edge - edge.mean(axis=0)
     y, x = near["pitch"][:, 1], near["pitch"][:, 0]
     assert np.ptp(x[y < 0]) < np.ptp(x[y > 0])  # the upper side is farther away, hence shorter
@@ -149,7 +142,7 @@ def test_a_tiny_board_is_not_aliased(dx, dy):
     placed = pose_board(SMALL, BOARD, 0.5, roll_deg=20)
     moved = Pose(placed.R_board2camera, placed.t_camera + np.array([dx, dy, 0]) * placed.t_camera[2] / SMALL.focal_px)
     scene = np.zeros((310, 406), np.uint8)
-    image = render_board(scene, SMALL, moved, BOARD, Look(0, 240, edge=1)).image
+    image = render_board(scene, SMALL, moved, BOARD, Appearance(0, 240, edge=1)).image
     board_px = 0.005 * image.size
     black = 6 * np.pi * (0.08**2) / 2  # half of six discs, in board areas
     assert np.isclose(image.sum(), 240 * board_px * (1 - black), rtol=0.005)
@@ -158,7 +151,7 @@ def test_a_tiny_board_is_not_aliased(dx, dy):
 def test_light_falls_along_its_slope_and_ink_with_it():
     placed = pose_board(SMALL, BOARD, 16)
     scene = np.full((310, 406), 90, np.uint8)
-    image = render_board(scene, SMALL, placed, BOARD, Look(40, 200, light=0.8, slope=(0.2, 0))).image.astype(int)
+    image = render_board(scene, SMALL, placed, BOARD, Appearance(40, 200, light=0.8, slope=(0.2, 0))).image.astype(int)
     middle = image[155]
     inside = np.flatnonzero(middle != 90)
     left, right = inside[5], inside[-6]
@@ -171,10 +164,10 @@ def test_light_falls_along_its_slope_and_ink_with_it():
 def test_the_shadow_falls_on_the_scene_and_not_on_the_board():
     placed = pose_board(SMALL, BOARD, 16)
     scene = np.full((310, 406), 90, np.uint8)
-    look = Look(40, 200, light=0.8, slope=(0.2, 0))
-    plain = render_board(scene, SMALL, placed, BOARD, look)
-    shaded = render_board(scene, SMALL, placed, BOARD, Look(40, 200, light=0.8, slope=(0.2, 0), shadow=0.5))
-    board = outline_px(SMALL, placed, BOARD)
+    appearance = Appearance(40, 200, light=0.8, slope=(0.2, 0))
+    plain = render_board(scene, SMALL, placed, BOARD, appearance)
+    shaded = render_board(scene, SMALL, placed, BOARD, Appearance(40, 200, light=0.8, slope=(0.2, 0), shadow=0.5))
+    board = project_outline(SMALL, placed, BOARD)
     (x0, y0), (x1, y1) = np.ceil(board.min(axis=0)).astype(int) + 1, board.max(axis=0).astype(int) - 1
     assert (plain.image[y0:y1, x0:x1] == shaded.image[y0:y1, x0:x1]).all()
     taken = plain.image.astype(int) - shaded.image
@@ -186,9 +179,9 @@ def test_the_shadow_falls_on_the_scene_and_not_on_the_board():
 def test_colour_is_the_same_in_all_channels():
     placed = pose_board(SMALL, BOARD, 16, pitch_deg=30)
     scene = np.random.default_rng(0).integers(0, 255, (310, 406), dtype=np.uint8)
-    look = Look(40, 200, light=0.9, slope=(0.1, 0.1), shadow=0.3)
-    grey = render_board(scene, SMALL, placed, BOARD, look).image
-    colour = render_board(np.dstack([scene] * 3), SMALL, placed, BOARD, look).image
+    appearance = Appearance(40, 200, light=0.9, slope=(0.1, 0.1), shadow=0.3)
+    grey = render_board(scene, SMALL, placed, BOARD, appearance).image
+    colour = render_board(np.dstack([scene] * 3), SMALL, placed, BOARD, appearance).image
     assert (colour == grey[..., None]).all()
 
 
@@ -196,7 +189,7 @@ def test_what_leaves_the_image_is_not_visible():
     frontal = rotation_xyz(0, 0, 0)
     depth = 400.0
     out = Pose(frontal, np.array([-depth * SMALL.K[0, 2] / SMALL.focal_px - 0.36 * 187.5, 0, depth]))
-    scene = render_board(np.full((310, 406), 90, np.uint8), SMALL, out, BOARD, Look(40, 200))
+    scene = render_board(np.full((310, 406), 90, np.uint8), SMALL, out, BOARD, Appearance(40, 200))
     k = scene.keypoints
     assert np.isclose(k["x"][0], 0)
     assert np.isclose(k["visible"][0], 0.5 + 0.5 * 2 / np.pi / k["radius_major"][0], atol=0.01)  # half a pixel more

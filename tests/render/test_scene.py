@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from kpbench.geometry.homography import project, project_disc
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Limits, Placement, measure_contrast, random_placements, render_scene
+from kpbench.render.placement import Limits, Placement, random_placements
+from kpbench.render.scene import measure_contrast, render_scene
 
 FOUR = shipped_patches()
 

@@ -103,24 +103,24 @@ def test_images_must_show_the_board():
 def test_a_suites_truth_is_its_board_seen_by_its_camera(board):
     config = SuiteConfig(load_suite("paper-v1"), images=1, size_px=(640, 480), only=("pitch",), board=board)
     points, camera = board_in_view(config.to_dict())
-    shots = [config.shot(n) for n in range(0, config.n, 5)]
-    n = len(shots)
-    counts = [len(shot.keypoints) for shot in shots]
+    views = [config.view(n) for n in range(0, config.n, 5)]
+    n = len(views)
+    counts = [len(view.keypoints) for view in views]
     truth = Truth(
         np.arange(n),
         np.append(0, np.cumsum(counts)),
-        np.concatenate([shot.keypoints for shot in shots]),
+        np.concatenate([view.keypoints for view in views]),
         np.array(["pitch"] * n),
-        np.array([shot.rung for shot in shots]),
+        np.array([view.rung for view in views]),
         np.arange(n),
     )
-    places = [np.stack([shot.keypoints["x"], shot.keypoints["y"]], axis=1) for shot in shots]
+    places = [np.stack([view.keypoints["x"], view.keypoints["y"]], axis=1) for view in views]
     exact = [Detections(xy, np.ones(len(xy))) for xy in places]
     scores = score(truth, exact, resamples=0)
     e = compute_pose_errors(scores.outcomes, points, camera)
     assert np.nanmax(e.translation_percent) < 1e-3
     groups = group_pose_errors(scores, e)
-    rungs = sorted({s.rung for s in shots})
+    rungs = sorted({v.rung for v in views})
     assert [(g.condition, g.rung) for g in groups] == [(None, None), *(("pitch", r) for r in rungs)]
     assert (groups[0].images, groups[0].with_pose) == (n, n)
     table = pose_table(scores, groups)

@@ -9,9 +9,9 @@ from helpers import digests
 
 import kpbench.synth.suite
 from kpbench.dataset.generation import generate
-from kpbench.degrade.effects import blur
+from kpbench.degrade.blurs import blur
 from kpbench.errors import DataError
-from kpbench.render.background import procedural
+from kpbench.render.background import procedural_background
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite, shipped_suites
 
@@ -27,10 +27,21 @@ def truth_digest(suite, scenes=2):
     made = SuiteConfig(load_suite(suite), images=scenes)
     said = hashlib.sha256()
     for index in range(made.n):
-        shot = made.shot(index)
-        places = [np.round(shot.keypoints[name], 4).tolist() for name in ("x", "y", "radius_major", "radius_minor")]
-        look = [round(v, 6) for v in (shot.look.black, shot.look.white, shot.look.light, *shot.look.slope)]
-        row = [shot.condition, shot.rung, shot.scene, shot.keypoints["patch_id"].tolist(), places, look, shot.effects]
+        view = made.view(index)
+        places = [np.round(view.keypoints[name], 4).tolist() for name in ("x", "y", "radius_major", "radius_minor")]
+        appearance = [
+            round(v, 6)
+            for v in (view.appearance.black, view.appearance.white, view.appearance.light, *view.appearance.slope)
+        ]
+        row = [
+            view.condition,
+            view.rung,
+            view.scene_id,
+            view.keypoints["patch_id"].tolist(),
+            places,
+            appearance,
+            view.effects,
+        ]
         said.update(json.dumps(row).encode())
     said.update("".join(patch.digest for patch in made.suite.patches).encode())
     return said.hexdigest()[:16]
@@ -65,8 +76,8 @@ def test_the_papers_conditions_are_the_papers():
 
 def test_one_scene_is_the_same_under_every_rung_and_patch():
     made = config()
-    blurred = [n for n in range(made.n) if made.shot(n).condition == "blur"]
-    pitch0 = next(n for n in range(made.n) if made.shot(n).condition == "pitch")
+    blurred = [n for n in range(made.n) if made.view(n).condition == "blur"]
+    pitch0 = next(n for n in range(made.n) if made.view(n).condition == "pitch")
     for step, patch in [(0, 0), (3, 2)]:
         worn, _ = made.make(blurred[0] + (step * 4 + patch) * 2 + 1)
         clean, _ = made.make(pitch0 + patch * 2 + 1)
@@ -87,23 +98,23 @@ def test_noise_of_one_scene_is_one_field_scaled():
 
 def test_the_order_of_the_images():
     made = config(only=("scale", "noise"))
-    seen = [(s.condition, s.rung, int(s.keypoints["patch_id"][0]), s.scene) for s in map(made.shot, range(made.n))]
+    seen = [(s.condition, s.rung, int(s.keypoints["patch_id"][0]), s.scene_id) for s in map(made.view, range(made.n))]
     rungs = [("scale", r) for r in (0.5, 1, 2, 4, 8, 16, 32)] + [("noise", r) for r in (15, 30, 45, 60)]
     assert seen == [(c, r, patch, scene) for c, r in rungs for patch in range(4) for scene in range(2)]
 
 
 def test_fewer_images_and_fewer_conditions_are_a_part_of_more():
     many, few = config(images=3), config(images=2, only=("dimming",))
-    shot = few.shot(7)
-    assert (shot.condition, shot.rung, shot.scene) == ("dimming", 10, 1)
-    same = [n for n in range(many.n) if many.shot(n).condition == "dimming"][3 * 3 + 1]
+    view = few.view(7)
+    assert (view.condition, view.rung, view.scene_id) == ("dimming", 10, 1)
+    same = [n for n in range(many.n) if many.view(n).condition == "dimming"][3 * 3 + 1]
     assert (few.make(7)[0].image == many.make(same)[0].image).all()
 
 
 def test_a_smaller_camera_sees_the_same():
     large, small = config(size_px=(1624, 1240)), config(size_px=(812, 620))
     for n in (0, 50, 100):
-        a, b = large.shot(n).keypoints, small.shot(n).keypoints
+        a, b = large.view(n).keypoints, small.view(n).keypoints
         assert np.allclose((a["x"] + 0.5) / 2 - 0.5, b["x"])
         assert np.allclose((a["y"] + 0.5) / 2 - 0.5, b["y"])
         assert np.allclose(a["radius_major"] / 2, b["radius_major"])
@@ -112,7 +123,7 @@ def test_a_smaller_camera_sees_the_same():
 
 def test_a_lens_bends_the_board():
     straight, bent = config(only=("scale",)), config(only=("scale",), distortion=(-0.3,))
-    a, b = (c.shot(40).keypoints for c in (straight, bent))
+    a, b = (c.view(40).keypoints for c in (straight, bent))
     assert abs(a["x"] - b["x"]).max() > 0.3
     assert bent.to_dict()["distortion"] == [-0.3, 0, 0, 0, 0]
 
@@ -129,7 +140,7 @@ def test_every_extended_condition_changes_the_image():
     base = config(only=("pitch",), images=1).make(0)[0].image
     firsts = {}
     for n in range(0, made.n, 4):
-        firsts.setdefault(made.shot(n).condition, n)
+        firsts.setdefault(made.view(n).condition, n)
     for n in firsts.values():
         sample, _ = made.make(n)
         assert (sample.image != base).any()
@@ -211,9 +222,9 @@ def test_a_wrong_suite_is_one_line(tmp_path, old, new, says):
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"images": 0}, "--images is 0"),
-        ({"seed": -1}, "--seed is -1"),
-        ({"size_px": (30, 30)}, "--size is 30x30"),
+        ({"images": 0}, "`images` is 0"),
+        ({"seed": -1}, "`seed` is -1"),
+        ({"size_px": (30, 30)}, "`size_px` is 30x30"),
         ({"only": ("scale", "fog")}, "paper-v1 has no condition 'fog', only: scale, pitch, blur, dimming, noise"),
     ],
 )
@@ -224,7 +235,9 @@ def test_a_value_out_of_range_is_one_line(changes, says):
 
 def test_a_background_is_made_once_though_every_rung_shows_it(tmp_path, monkeypatch):
     made = []
-    monkeypatch.setattr(kpbench.synth.suite, "procedural", lambda *a: made.append(a) or procedural(*a))
+    monkeypatch.setattr(
+        kpbench.synth.suite, "procedural_background", lambda *a: made.append(a) or procedural_background(*a)
+    )
     config = SuiteConfig(load_suite("paper-v1"), images=6, size_px=(64, 64), only=("blur",), shard_size=3)
     assert len(generate(config, tmp_path / "a", workers=1).dataset) == 6 * 4 * 4
     assert len(made) == 6

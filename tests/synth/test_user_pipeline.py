@@ -9,8 +9,9 @@ from kpbench.errors import DataError
 from kpbench.fitting import design_fit as refine
 from kpbench.fitting.pyramid import pyramid
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Limits, random_placements, render_scene
-from kpbench.synth.user_pipeline import augment, load_augmentation
+from kpbench.render.placement import Limits, random_placements
+from kpbench.render.scene import render_scene
+from kpbench.synth.user_pipeline import load_augmentation, run_pipeline
 
 WITH_ROOM = Limits(count=(6, 6), radius_px=(20, 50), tilt_deg=30)
 
@@ -44,7 +45,7 @@ def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
     canonical = load_augmentation(saved(tmp_path, *pipeline))
     off = []
     for seed in range(4):
-        image, moved = augment(*scene(seed), canonical, seed)
+        image, moved = run_pipeline(*scene(seed), canonical, seed)
         carried = [placement for placement in moved if placement is not None]
         H = np.array([placement.H_patch2image for placement in carried])
         affine = H[:, :2, :2] - H[:, :2, 2:] @ H[:, 2:, :2]
@@ -57,7 +58,7 @@ def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
 
 def test_what_moves_nothing_leaves_the_truth_as_it_is(tmp_path):
     image, placements = scene(0)
-    done, carried = augment(image, placements, load_augmentation(saved(tmp_path, ("GaussNoise", {}))), 3)
+    done, carried = run_pipeline(image, placements, load_augmentation(saved(tmp_path, ("GaussNoise", {}))), 3)
     assert carried == placements
     assert (done != image).any()
 
@@ -67,13 +68,13 @@ def test_what_moves_nothing_leaves_the_truth_as_it_is(tmp_path):
     [
         ("HorizontalFlip", {}, "mirrors"),
         ("Resize", {"height": 100, "width": 100}, "makes 100x100"),
-        ("RandomCrop", {"height": 900, "width": 900}, "--augment: "),
+        ("RandomCrop", {"height": 900, "width": 900}, "`augmentation`: "),
     ],
 )
 def test_what_cannot_be_carried_is_refused(name, options, said, tmp_path):
     canonical = load_augmentation(saved(tmp_path, (name, options)))
     with pytest.raises(DataError) as refused:
-        augment(*scene(1), canonical, 0)
+        run_pipeline(*scene(1), canonical, 0)
     assert said in str(refused.value)
     assert "\n" not in str(refused.value)
 

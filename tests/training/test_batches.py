@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from kpbench.errors import DataError
 from kpbench.geometry.homography import project_disc
 from kpbench.patches.design import shipped_patches
-from kpbench.render.scene import Limits, Placement
+from kpbench.render.placement import Limits, Placement
 from kpbench.training.batches import Job, SampleConfig, load_photos, make_batch, training_batches
 from kpbench.training.crops import Disc, _paint_all, _poses
 
