@@ -21,6 +21,8 @@ from .patches.design import load_patches as load_patches
 from .patches.design import shipped_patches as shipped_patches
 from .predictions.files import read_predictions as read_predictions
 from .predictions.files import write_predictions as write_predictions
+from .printing.prints import print_boards as print_boards
+from .printing.prints import print_patches as print_patches
 from .render.scene import render_scene as render_scene
 from .report.report import write_report as write_report
 from .scoring.comparison import compare as compare

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kpbench.cli.options import Finite, Two
+
+if TYPE_CHECKING:
+    from kpbench.patches.board import Board
+    from kpbench.patches.design import Patch
 
 
 @click.command("render-patches")
@@ -91,50 +96,65 @@ def render_patches(
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
       kpbench render-patches --measured 99.8,100.1
     """
-    from tqdm import tqdm
-
-    from kpbench.errors import DesignError
-    from kpbench.patches.board import GRID_PITCH, HEXAGON_DIAMETER, find_patch, grid_board, hexagon_board, load_board
+    from kpbench.cli.progress import progress_bar
+    from kpbench.patches.board import DEFAULT_DIAMETER_MM, find_patch
     from kpbench.patches.design import load_patches, shipped_patches
-    from kpbench.printing.sheet import board_sheet, file_stem, parse_page_format, patch_sheet, save_sheet
+    from kpbench.printing.prints import print_boards, print_patches
+    from kpbench.printing.sheet import parse_page_format
     from kpbench.printing.sidecar import correct_sidecars
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
+    _check_usage(given, board)
     if measured is not None:
-        if given - {"measured", "out"}:
-            raise click.UsageError("--measured corrects what is in --out and takes no other option.")
         for path in correct_sidecars(out, measured):
             click.echo(path)
         return
-    if board is None and tile:
+    patches = load_patches(designs) if designs else shipped_patches()
+    if chosen:
+        patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
+    boards = _boards(board, patches, bool(designs), diameter_mm) if board is not None else ()
+    wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
+    layout: dict[str, Any] = {"page": parse_page_format(page, landscape, not no_labels, mirror), "dpi": dpi}
+    with progress_bar(len(boards) or 1, "print", unit="sheet", shown=png) as progress:
+        layout |= {"formats": wanted, "progress": progress}
+        if board is not None:
+            files = print_boards(boards, out, tile=tile, **layout)
+        else:
+            files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
+    for path in files:
+        click.echo(path)
+    click.echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
+
+
+def _check_usage(given: set[str], board: str | None) -> None:
+    """Refuse options that do not go together."""
+    if "measured" in given and given - {"measured", "out"}:
+        raise click.UsageError("--measured corrects what is in --out and takes no other option.")
+    if board is None and "tile" in given:
         raise click.UsageError("--tile spreads a board; give --board.")
     if board is not None and "copies" in given:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
-    if board not in (None, "hexagon", "grid") and chosen:
+    if board not in (None, "hexagon", "grid") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")
 
-    paper = parse_page_format(page, landscape, labels=not no_labels, mirrored=mirror)
-    diameter = 30.0 if diameter_mm is None else diameter_mm
-    own = load_patches(designs) if designs else None
-    patches = shipped_patches() if own is None else own
-    if chosen:
-        patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
-    if board is None:
-        sheets = [patch_sheet(patches, diameter, paper, copies)]
-    elif board == "hexagon":
-        boards = [hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in patches]
-        sheets = [board_sheet(b, paper, tile) for b in boards]
-    elif board == "grid":
-        sheets = [board_sheet(grid_board(patches, 4, 3, diameter, GRID_PITCH * diameter), paper, tile)]
-    elif not Path(board).is_file():
-        raise DesignError(f"{board}: no such file, expected hexagon, grid or a board's TOML file")
-    else:
-        sheets = [board_sheet(load_board(board, own, diameter_mm), paper, tile)]
-    stems = [file_stem(one.name) for one in sheets]
-    if twice := [stem for stem in stems if stems.count(stem) > 1]:
-        raise DesignError(f"two boards would be written to {twice[0]}; choose one with --patch ID")
-    suffixes = [s for s, wanted in {".pdf": pdf, ".svg": svg, ".png": png, ".dxf": dxf}.items() if wanted]
-    for one in tqdm(sheets, disable=not (png and sys.stderr.isatty()), leave=False):
-        for path in save_sheet(one, out, suffixes or [".pdf"], dpi):
-            click.echo(path)
-    click.echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
+
+def _boards(name: str, patches: Sequence[Patch], own: bool, diameter_mm: float | None) -> list[Board]:
+    """Make the boards that --board asks for: hexagons of one design each, one grid, or the board of a file."""
+    from kpbench.errors import DesignError
+    from kpbench.patches.board import (
+        DEFAULT_DIAMETER_MM,
+        GRID_PITCH,
+        HEXAGON_DIAMETER,
+        grid_board,
+        hexagon_board,
+        load_board,
+    )
+
+    diameter = diameter_mm or DEFAULT_DIAMETER_MM
+    if name == "hexagon":
+        return [hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in patches]
+    if name == "grid":
+        return [grid_board(patches, 4, 3, diameter, GRID_PITCH * diameter)]
+    if not Path(name).is_file():
+        raise DesignError(f"{name}: no such file, expected hexagon, grid or a board's TOML file")
+    return [load_board(name, patches if own else None, diameter_mm)]

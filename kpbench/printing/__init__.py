@@ -1,1 +1,5 @@
 """Pages in millimetres, one writer for each file format, sheets and their sidecars."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

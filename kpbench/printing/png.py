@@ -39,7 +39,7 @@ def to_png(page: Page, dpi: float) -> bytes:
     width, height = round(page.width * scale), round(page.height * scale)
     if width * height > MAX_PIXELS:
         raise DesignError(
-            f"{page.width:g} x {page.height:g} mm at {dpi:g} dpi is too large for a PNG; use a lower --dpi"
+            f"{page.width:g} x {page.height:g} mm at {dpi:g} dpi is too large for a PNG; use a lower `dpi`"
         )
     paper = np.full((height, width), 255, np.uint8)
 

@@ -172,7 +172,7 @@ def board_sheet(board: Board, paper: PageFormat, tile: bool = False) -> Sheet:
             f"board {board.name!r} is {board.side_x_mm:g} x {board.side_y_mm:g} mm, and the {paper.width:g} x "
             f"{paper.height:g} mm page holds {room_x:g} x {room_y:g} mm; the largest diameter that fits, the whole "
             f"board made smaller with it, is {_floored(scale * max(k.diameter_mm for k in board.keypoints))} mm; "
-            "--tile spreads the board over pages"
+            "`tile=True` spreads the board over pages"
         )
     tiles = cut_into_tiles(board, room_x, room_y)
     keypoints = []

@@ -163,7 +163,7 @@ def test_png_says_its_resolution_and_is_drawn_at_it(dpi):
 
 
 def test_png_that_would_not_fit_in_memory_is_refused():
-    with pytest.raises(DesignError, match="use a lower --dpi"):
+    with pytest.raises(DesignError, match="use a lower `dpi`"):
         to_png(page_of(HALF_DISC, size=(3000.0, 3000.0)), 4800)
 
 

@@ -198,7 +198,7 @@ def test_what_does_not_fit_names_the_largest_that_does(paper):
 
 
 def test_a4_holds_the_thirty_mm_hexagon():
-    with pytest.raises(DesignError, match=r"is 30\.08 mm; --tile spreads"):
+    with pytest.raises(DesignError, match=r"is 30\.08 mm; `tile=True` spreads"):
         board_sheet(hexagon_board(PATCHES[0], 200), A4)
 
 
