@@ -30,10 +30,10 @@ from kpbench.errors import DataError
 from kpbench.files import make_folder, require_own_folder, write_atomic
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
-from kpbench.report.figures import breakpoint_table, overview_table, paper_table
 from kpbench.report.paper import PAPER
 from kpbench.report.report import Report, write_report
 from kpbench.report.result_files import collect_provenance, encode_scores
+from kpbench.report.score_tables import breakpoint_table, overview_table, paper_table
 from kpbench.report.tables import Table
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig

@@ -14,7 +14,6 @@ from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite, write_atomic
 from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import read_predictions
-from kpbench.report.figures import pose_table
 from kpbench.report.report import Report, require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
@@ -22,6 +21,7 @@ from kpbench.report.result_files import (
     encode_scores,
     encode_scores_csv,
 )
+from kpbench.report.score_tables import pose_table
 from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pose_errors
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score

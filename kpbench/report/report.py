@@ -15,25 +15,27 @@ from typing import TYPE_CHECKING, Any
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
-from kpbench.report.figures import (
+from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
+from kpbench.report.score_charts import (
     Figure,
+    eps_chart,
+    precision_recall_chart,
+    radius_chart,
+    severity_chart,
+    taxonomy_charts,
+)
+from kpbench.report.score_tables import (
     breakpoint_table,
     condition_table,
     confusion_table,
     count_table,
     difference_table,
-    eps_chart,
     group_table,
     overview_table,
     paper_table,
-    precision_recall_chart,
-    radius_chart,
-    severity_chart,
     synthetic_table,
-    taxonomy_charts,
     verdict_table,
 )
-from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores

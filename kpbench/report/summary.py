@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kpbench.report.figures import difference_table, group_table, pose_table, verdict_table
+from kpbench.report.score_tables import difference_table, group_table, pose_table, verdict_table
 from kpbench.report.tables import Estimate, Table, cell_text, to_plain
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.comparison import Comparison

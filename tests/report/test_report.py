@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError
-from kpbench.report import figures as exhibits
 from kpbench.report.charts import Series, bar_chart, line_chart
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
 from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report, write_report
 from kpbench.report.result_files import encode_scores, encode_scores_csv
+from kpbench.report.score_charts import severity_chart
+from kpbench.report.score_tables import paper_table
 from kpbench.report.tables import Estimate, Table, to_latex, to_markdown, to_plain
 from kpbench.report.worst_cases import pick_worst_cases
 from kpbench.scoring.breakpoints import find_breakpoints
@@ -125,13 +126,13 @@ def test_the_papers_numbers():
 
 
 def test_the_papers_table_says_what_is_simulated(scores):
-    table = exhibits.paper_table([scores], PAPER["blur"])
+    table = paper_table([scores], PAPER["blur"])
     assert table.title == "Blur kernel (paper: photographs; ours: simulated)"
     assert table.columns == ("metric", "detector", "images", "3 px", "7 px", "11 px", "15 px")
     assert table.rows[0] == ("detection", "paper", "photographs", 1.0, 0.986, 0.882, 0.605)
     assert table.rows[1][:3] == ("detection", "detector", "simulated")
     assert [cell.value for cell in table.rows[1][3:]] == [1, 0.95, 0.5, 0.25]
-    partly = exhibits.paper_table([score(*ladder(share={3: 1.0}), resamples=0)], PAPER["blur"])
+    partly = paper_table([score(*ladder(share={3: 1.0}), resamples=0)], PAPER["blur"])
     assert [cell and cell.value for cell in partly.rows[1][3:]] == [1, None, None, None]
 
 
@@ -190,7 +191,7 @@ def test_charts_are_xml_with_a_gap_where_a_value_is_missing():
 
 
 def test_severity_chart_shows_the_paper(scores):
-    figure = exhibits.severity_chart([scores], "blur")
+    figure = severity_chart([scores], "blur")
     assert figure.legend == (("detector", 0), ("paper, photographs", 7))
     titles = [e.text for e in ET.fromstring(figure.svg).iter("title")]
     assert "paper, photographs: 0.605 at 15" in titles

@@ -1,12 +1,11 @@
-"""Make single tables and charts of the scores of one or several detectors. A report consists of them."""
+"""Tabulate the scores of one or several detectors."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple
 
-from kpbench.report.charts import Series, bar_chart, line_chart
-from kpbench.report.paper import PAPER, SYNTHETIC, PaperTable, paper_value
+from kpbench.report.paper import SYNTHETIC, PaperTable, paper_value
 from kpbench.report.tables import Cell, Estimate, Table
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import DETECTION_SCORE_LIMIT, Breakpoint, find_breakpoints
@@ -15,40 +14,11 @@ from kpbench.scoring.groups import Group
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
 
-PAPER_STYLE = 7
-"""Number of the colour of the paper's lines: grey."""
 SHORT_LABELS = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
 """The paper's metrics in narrow columns."""
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A chart with its caption and legend.
-
-    Attributes
-    ----------
-    caption : str
-    svg : str
-        The chart, an ``<svg>`` element.
-    legend : tuple of (name, style)
-        Name and number of the colour of each series.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> kpbench.report.Figure("Nothing", "<svg></svg>").legend
-    ()
-    """
-
-    caption: str
-    svg: str
-    legend: tuple[tuple[str, int], ...] = ()
-
-
-# --- tables -----------------------------------------------------------------------------------------------------
-
-
-def estimate(group: Group | None, metric: str) -> Estimate | None:
+def get_estimate(group: Group | None, metric: str) -> Estimate | None:
     """Return a metric of a group with its interval; None for a group of None."""
     return None if group is None else Estimate(group.metrics[metric], group.intervals.get(metric))
 
@@ -67,7 +37,7 @@ def overview_table(runs: Sequence[Scores]) -> Table:
     (('detector', 'detection score'), 'oracle')
     """
     metrics = (*PAPER_METRICS, "precision", "f1", "average_precision", "error_median_px", "error_p95_px")
-    rows = [(run.name, *(estimate(run.overall, metric) for metric in metrics)) for run in runs]
+    rows = [(run.name, *(get_estimate(run.overall, metric) for metric in metrics)) for run in runs]
     failed = [f"{run.name} failed on {len(f)} images" for run in runs if (f := run.detector.get("failures"))]
     note = f"{', '.join(failed)}, which count as no detections." if failed else ""
     return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows), note)
@@ -100,7 +70,7 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
         theirs = [paper_value(table.condition, rung, metric) for rung in rungs]
         rows.append((label, "paper", table.images, *(None if v is None else float(v) for v in theirs)))
         for run in runs:
-            found = [estimate(run.group(table.condition, rung), metric) for rung in rungs]
+            found = [get_estimate(run.group(table.condition, rung), metric) for rung in rungs]
             rows.append((label, run.name, images, *found))
             rows.append((label, f"{run.name} less the paper", "", *map(_difference, found, theirs)))
     unit = f" {table.unit}" if table.unit else ""
@@ -127,7 +97,7 @@ def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
     for metric in PAPER_METRICS:
         rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
         for run in runs:
-            cells = (estimate(run.overall, metric) if k == deteriorate else None for k in SYNTHETIC)
+            cells = (get_estimate(run.overall, metric) if k == deteriorate else None for k in SYNTHETIC)
             rows.append((SHORT_LABELS[metric], run.name, "simulated", *cells))
     return Table(
         "Synthetic validation set (paper: its own simulation; ours: simulated)",
@@ -141,7 +111,7 @@ def condition_table(runs: Sequence[Scores], condition: str) -> Table:
     """Tabulate the paper's three metrics over the rungs of a condition that the paper does not have."""
     rungs = sorted({r for run in runs for r in run.conditions.get(condition, ())})
     rows = [
-        (SHORT_LABELS[metric], run.name, *(estimate(run.group(condition, r), metric) for r in rungs))
+        (SHORT_LABELS[metric], run.name, *(get_estimate(run.group(condition, r), metric) for r in rungs))
         for metric in PAPER_METRICS
         for run in runs
     ]
@@ -227,7 +197,7 @@ def group_table(
             *(values[n] for values in keys.values()),
             g.counts["images"],
             g.counts["truths"],
-            *(estimate(g, m) for m in metrics),
+            *(get_estimate(g, m) for m in metrics),
         )
         for n, g in enumerate(groups)
     )
@@ -334,111 +304,3 @@ def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
     columns = ("condition", "rung", "images", "with a pose", *errors)
     note = "From at least four matched keypoints an image; translation in % of the distance of board and camera."
     return Table(f"Pose of the board: {run.name}", columns, tuple(rows), note)
-
-
-# --- charts -----------------------------------------------------------------------------------------------------
-
-
-def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detection_score") -> Figure:
-    """Draw a metric over the rungs of a condition: a line per detector with its 95 % band, the paper's line dashed.
-
-    Parameters
-    ----------
-    runs : sequence of Scores
-    condition : str
-    metric : str
-        One of :data:`kpbench.scoring.METRICS`.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
-    >>> kpbench.report.severity_chart([scores], "blur").caption
-    'blur: detection score'
-    """
-    series = []
-    for n, run in enumerate(runs):
-        rungs = run.conditions.get(condition, [])
-        found = [estimate(run.group(condition, r), metric) or Estimate(None) for r in rungs]
-        series.append(Series(run.name, rungs, [e.value for e in found], [e.interval for e in found], n))
-    paper = PAPER.get(condition)
-    if paper:
-        values = [paper_value(condition, r, metric) for r in paper.rungs]
-        series.append(Series(f"paper, {paper.images}", paper.rungs, values, style=PAPER_STYLE, dashed=True))
-    ticks = sorted({x for s in series for x in s.x})
-    label = f"{paper.title} ({paper.unit})" if paper and paper.unit else paper.title if paper else condition
-    bounded = metric not in ("average_false_alarm", "average_false_alarm_literal") and not metric.startswith("error")
-    svg = line_chart(
-        series,
-        label,
-        LABELS[metric],
-        y_range=(0.0, 1.0) if bounded else None,
-        x_ticks=ticks,
-        log_x=min(ticks, default=0) > 0 and max(ticks) / min(ticks) > 20,
-    )
-    return Figure(f"{condition}: {LABELS[metric]}", svg, tuple((s.name, s.style) for s in series))
-
-
-def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
-    """Draw precision over recall at all thresholds on the score."""
-    series = []
-    for n, run in enumerate(runs):
-        recall = [0.0 if r is None else r for r in run.curve["recall"]]
-        series.append(Series(run.name, recall, run.curve["precision"], style=n))
-    svg = line_chart(
-        series, "recall", "precision", y_range=(0.0, 1.0), x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1), markers=False
-    )
-    return Figure("Precision and recall over all thresholds", svg, tuple((s.name, s.style) for s in series))
-
-
-def eps_chart(runs: Sequence[Scores]) -> Figure:
-    """Draw the detection score over the largest distance of a match, ε."""
-    series = [
-        Series(run.name, [e or 0.0 for e in run.eps_curve["eps"]], run.eps_curve["detection_score"], style=n)
-        for n, run in enumerate(runs)
-    ]
-    label = f"ε, in radii ({runs[0].settings.eps_radius})"
-    ticks = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
-    svg = line_chart(series, label, LABELS["detection_score"], y_range=(0.0, 1.0), x_ticks=ticks, log_x=True)
-    return Figure("Detection score over ε", svg, tuple((s.name, s.style) for s in series))
-
-
-def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
-    """Draw a metric over the radius of the true keypoints' discs. The point of a bin is midway between its edges."""
-    series = []
-    for n, run in enumerate(runs):
-        bins = [(g, *g.key.radius_px) for g in run.by if g.key.radius_px is not None]
-        middles = [(low + (high or 2 * low)) / 2 for _, low, high in bins]
-        found = [Estimate(g.metrics[metric], g.intervals.get(metric)) for g, _, _ in bins]
-        series.append(Series(run.name, middles, [e.value for e in found], [e.interval for e in found], n))
-    ticks = sorted({x for s in series for x in s.x})
-    svg = line_chart(
-        series,
-        "radius of the disc (px, middle of its bin)",
-        LABELS[metric],
-        y_range=(0.0, 1.0) if metric == "detection_score" else None,
-        x_ticks=ticks,
-        log_x=True,
-    )
-    return Figure(f"{LABELS[metric]} by radius", svg, tuple((s.name, s.style) for s in series))
-
-
-def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:
-    """Draw the shares of the outcomes of true keypoints, and of detections: a bar per detector."""
-    keypoints: tuple[str, ...] = ("found with the right ID", "found with a wrong ID", "missed")
-    if any(run.overall.counts["id_correct"] is None for run in runs):
-        keypoints = ("found", "missed")
-    detections = ("matched", "duplicate", "near miss", "clutter")
-    truth, found = [], []
-    for run in runs:
-        n = {name: count or 0 for name, count in run.overall.counts.items()}
-        parts = (n["id_correct"], n["wrong_id"]) if len(keypoints) == 3 else (n["matched"],)
-        truth.append((run.name, (*parts, n["missed"])))
-        found.append((run.name, (n["matched"], n["duplicate"], n["near_miss"], n["clutter"])))
-    styles = (0, 4, 1) if len(keypoints) == 3 else (0, 1)
-    return (
-        Figure("True keypoints", bar_chart(truth, keypoints, styles), tuple(zip(keypoints, styles, strict=True))),
-        Figure(
-            "Detections", bar_chart(found, detections, (0, 3, 4, 1)), tuple(zip(detections, (0, 3, 4, 1), strict=True))
-        ),
-    )
