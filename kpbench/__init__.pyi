@@ -1,3 +1,5 @@
+from .benchmark import BenchRun as BenchRun
+from .benchmark import SuiteReport as SuiteReport
 from .benchmark import bench as bench
 from .benchmark import write_suite_reports as write_suite_reports
 from .dataset.export import export_dataset as export_dataset
@@ -9,6 +11,9 @@ from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
 from .errors import KpbenchError as KpbenchError
+from .evaluate import ComparedFiles as ComparedFiles
+from .evaluate import LabelledImages as LabelledImages
+from .evaluate import ScoredFile as ScoredFile
 from .evaluate import compare_files as compare_files
 from .evaluate import score_file as score_file
 from .fitting.design_fit import fit as fit

@@ -1,9 +1,9 @@
-"""The benchmark: suites, detectors over them, scores; what is done is kept, and an interrupted run goes on.
+"""Run detectors over benchmark suites and score them; keep all finished work, so that an interrupted run goes on.
 
-Everything lies in one folder, under names that hold what it was made from: a dataset's by its config, predictions
-by the dataset's fingerprint and by the detector's version, settings and weights. So nothing that is found there
-can be stale, and nothing has to be told to be resumed. A detector that tells no version looks again at each call.
-Scoring takes seconds and is always done again.
+Everything lies in one folder. The name of a dataset's folder holds a digest of its config. The name of a predictions
+file holds the dataset's fingerprint and a digest of the detector's version, settings and weights. So files of other
+inputs have other names, and a file that exists is always valid. A detector without a version runs again at each call.
+Scoring takes seconds and is repeated at each call.
 """
 
 from __future__ import annotations
@@ -40,22 +40,32 @@ from kpbench.synth.suite import SuiteConfig
 from kpbench.types import Predictions
 from kpbench.workers import Progress, run_jobs
 
-PART = 32  # images whose detections are kept together
+IMAGES_PER_PART = 32
+"""Number of images whose detections are kept in one file until all parts are joined."""
 
 
 @dataclass(frozen=True)
-class Benched:
-    """One detector on one suite.
+class BenchRun:
+    """The result of one detector on one suite.
 
     Attributes
     ----------
     config : SuiteConfig
-        With the board that the detector looks for.
+        The suite, with the board of the detector.
     dataset : Dataset
     predictions : Path
+        The predictions file.
     scores : Scores
     failures : tuple of (image_id, message)
-        Images on which the detector raised; they count as no detections.
+        Images on which the detector raised an error. They count as images without detections.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> suite = kpbench.SuiteConfig(kpbench.load_suite("paper-v1"), images=1, size_px=(203, 155), only=("blur",))
+    >>> [run] = kpbench.bench([suite], ["orb"], "bench", workers=1)
+    >>> run.config.n, run.predictions.suffix
+    (16, '.json')
     """
 
     config: SuiteConfig
@@ -67,39 +77,50 @@ class Benched:
 
 @dataclass(frozen=True)
 class SuiteReport:
-    """The results of one suite.
+    """The results of all detectors on one suite.
 
     Attributes
     ----------
     suite : str
+        Name of the suite.
     tables : tuple of Table
-        All detectors over all images, the paper's tables with our runs, and the breakpoints.
+        The detectors over all images, the paper's tables with the detectors below, and the breakpoints.
     page : Path
-        The report (HTML).
-    scores : Path
+        The report, HTML.
+    scores_folder : Path
         Folder with one scores file per detector.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from pathlib import Path
+    >>> kpbench.SuiteReport("paper-v1", (), Path("paper-v1.html"), Path("scores/paper-v1")).suite
+    'paper-v1'
     """
 
     suite: str
     tables: tuple[Table, ...]
     page: Path
-    scores: Path
+    scores_folder: Path
 
 
 @dataclass(frozen=True)
 class _Part:
-    """Some images of a dataset, to be shown to a detector, and the file for what it finds."""
+    """A job: run a detector over some images of a dataset, and keep its detections in a file.
+
+    ``description`` is the detector's name and version, ``first`` a position in the dataset.
+    """
 
     dataset: Path
     detector: str
-    about: dict[str, Any]
+    description: dict[str, Any]
     first: int
     count: int
     file: Path
 
 
-def images_to_do(suites: Sequence[SuiteConfig], detectors: Sequence[str]) -> int:
-    """How often ``progress`` of :func:`bench` will count: images made and images looked at."""
+def count_bench_images(suites: Sequence[SuiteConfig], detectors: Sequence[str]) -> int:
+    """Count the images that :func:`bench` will report to ``progress``: images made, and images shown to a detector."""
     boards = [load_detector(name).board for name in detectors]
     return sum(replace(suite, board=board).n for suite in suites for board in [*set(boards), *boards])
 
@@ -111,27 +132,40 @@ def bench(
     *,
     workers: int | None = None,
     progress: Progress = lambda images: None,
-) -> list[Benched]:
-    """Run detectors over suites, each on its own board, and score them.
+) -> list[BenchRun]:
+    """Run detectors over suites, each detector on its own board, and score them.
 
     Parameters
     ----------
     suites : sequence of SuiteConfig
-        Their ``board`` does not count.
-    detectors : names, see :func:`kpbench.detectors.load_detector`.
-    out : folder; made if it is not there. What an earlier run finished there is taken over.
-    workers : processes; None for one a core. Changes no result.
-    progress : called as images are made and looked at.
+        The field ``board`` is ignored.
+    detectors : sequence of str
+        Names as for :func:`kpbench.load_detector`.
+    out : str or Path
+        Folder, new or of an earlier run. Finished work of an earlier run is kept.
+    workers : int or None
+        Number of processes; None for one per core. It changes no result.
+    progress : function
+        Called with the number of images that were made, or shown to a detector, since the last call.
 
     Returns
     -------
-    list of Benched
+    list of BenchRun
         By suite, then by detector.
 
     Raises
     ------
     DataError
-        If a detector cannot be loaded, two have one name, a dataset cannot be made, or the folder holds other files.
+        If a detector cannot be loaded, two detectors have the same name, a dataset cannot be made, or the folder holds
+        other files.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> suite = kpbench.SuiteConfig(kpbench.load_suite("paper-v1"), images=1, size_px=(203, 155), only=("blur",))
+    >>> [run] = kpbench.bench([suite], ["orb"], "bench", workers=1)
+    >>> run.scores.overall.counts["images"], run.failures
+    (16, ())
     """
     require_own_folder(Path(out), "suites", "a bench")
     loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
@@ -145,130 +179,157 @@ def bench(
         for name, detector in loaded.items():
             config = replace(suite, board=detector.board)
             if config not in datasets:
-                datasets[config] = _make(config, Path(out) / "suites", workers, progress)
+                datasets[config] = _make_dataset(config, Path(out) / "suites", workers, progress)
             dataset = datasets[config]
             folder = Path(out) / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
-            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_mark(detector)[:8]}.json"
+            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_digest_detector(detector)[:8]}.json"
             runs.append((config, dataset, file))
             if detector.identity is None:
-                _forget(file)
+                _remove_predictions(file)
             if file.exists():
                 progress(len(dataset))
             else:
-                parts += _parts(dataset, name, {"name": detector.name, "version": detector.version}, file)
-    _detect(parts, workers, progress)
+                parts += _plan_parts(dataset, name, {"name": detector.name, "version": detector.version}, file)
+    _detect_parts(parts, workers, progress)
     for _, _, file in runs:
         if not file.exists():
-            _join(file)
-    return [_scored(*run) for run in runs]
+            _join_parts(file)
+    return [_score_run(*run) for run in runs]
 
 
-def _make(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
-    made_of = canonical_json([__version__, config.to_dict()]).encode()
-    place = folder / f"{config.name}-{hashlib.sha256(made_of).hexdigest()[:8]}"
+def _make_dataset(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
+    content = canonical_json([__version__, config.to_dict()]).encode()
+    place = folder / f"{config.name}-{hashlib.sha256(content).hexdigest()[:8]}"
     if (place / MANIFEST).exists():
         progress(config.n)
         return open_dataset(place)
     return generate(config, place, workers=workers, resume=True, progress=progress).dataset
 
 
-def _mark(detector: LoadedDetector) -> str:
-    """Digest of a detector and of the designs that it looks for."""
+def _digest_detector(detector: LoadedDetector) -> str:
+    """Return a digest of a detector and of the designs that it looks for."""
     parts = [detector.name, detector.identity, *(patch.digest for patch in shipped_patches())]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def _forget(file: Path) -> None:
-    """Remove predictions, whole or in parts."""
+def _remove_predictions(file: Path) -> None:
+    """Remove a predictions file and its parts."""
     file.unlink(missing_ok=True)
-    shutil.rmtree(file.with_suffix(".parts"), ignore_errors=True)
+    shutil.rmtree(_parts_folder(file), ignore_errors=True)
 
 
-def _parts(dataset: Dataset, detector: str, about: dict[str, Any], file: Path) -> list[_Part]:
-    """The parts of a predictions file, in a folder beside it until all are there."""
-    folder = make_folder(file.with_suffix(".parts"))
+def _parts_folder(file: Path) -> Path:
+    return file.with_suffix(".parts")
+
+
+def _plan_parts(dataset: Dataset, detector: str, description: dict[str, Any], file: Path) -> list[_Part]:
+    """Return the parts of a predictions file, and make the folder that holds them until they are joined."""
+    folder = make_folder(_parts_folder(file))
     return [
-        _Part(dataset.path, detector, about, first, min(PART, len(dataset) - first), folder / f"{first:08d}.json")
-        for first in range(0, len(dataset), PART)
+        _Part(
+            dataset.path,
+            detector,
+            description,
+            first,
+            min(IMAGES_PER_PART, len(dataset) - first),
+            folder / f"{first:08d}.json",
+        )
+        for first in range(0, len(dataset), IMAGES_PER_PART)
     ]
 
 
-def _detect(parts: Sequence[_Part], workers: int | None, progress: Progress) -> None:
-    todo = [part for part in parts if not part.file.exists()]
-    progress(sum(part.count for part in parts) - sum(part.count for part in todo))
-    for _ in run_jobs(_detect_part, todo, workers, progress):
+def _detect_parts(parts: Sequence[_Part], workers: int | None, progress: Progress) -> None:
+    """Run all parts whose files do not exist."""
+    missing = [part for part in parts if not part.file.exists()]
+    progress(sum(part.count for part in parts) - sum(part.count for part in missing))
+    for _ in run_jobs(_detect_part, missing, workers, progress):
         pass
 
 
 def _detect_part(part: _Part, progress: Progress) -> None:
-    dataset = _opened(part.dataset)
+    dataset = _open_once(part.dataset)
     images = range(part.first, part.first + part.count)
     found = detect_some(dataset, part.detector, None, images, progress)
     ids = [int(dataset.truth.image_id[n]) for n in images]
     failures = [[image_id, found[n][1]] for n, image_id in zip(images, ids, strict=True) if found[n][1]]
-    detections, about = [found[n][0] for n in images], part.about | _said(failures)
-    kept = Predictions.from_detections(detections, ids, about, str(dataset.path), dataset.fingerprint)
-    write_predictions(part.file, kept)
+    detections, description = [found[n][0] for n in images], part.description | _describe_failures(failures)
+    fingerprint = dataset.fingerprint
+    predictions = Predictions.from_detections(detections, ids, description, str(dataset.path), fingerprint)
+    write_predictions(part.file, predictions)
 
 
-def _said(failures: list[list[Any]]) -> dict[str, Any]:
-    """What a predictions file says of the images on which its detector raised."""
+def _describe_failures(failures: list[list[Any]]) -> dict[str, Any]:
+    """Return the field of a detector's description that lists the images on which it raised an error."""
     return {"failures": failures} if failures else {}
 
 
 @cache
-def _opened(path: Path) -> Dataset:
+def _open_once(path: Path) -> Dataset:
+    """Open a dataset once per process."""
     return open_dataset(path)
 
 
-def _join(file: Path) -> None:
-    """One predictions file of all its parts, which are then removed."""
-    folder = file.with_suffix(".parts")
-    parts = [read_predictions(path) for path in sorted(folder.glob("*.json"))]
-    about = parts[0].detector | _said([failure for part in parts for failure in part.detector.get("failures", [])])
+def _join_parts(file: Path) -> None:
+    """Write a predictions file from its parts, and remove the parts."""
+    parts = [read_predictions(path) for path in sorted(_parts_folder(file).glob("*.json"))]
+    failures = [failure for part in parts for failure in part.detector.get("failures", [])]
+    description = parts[0].detector | _describe_failures(failures)
     found = [detections for part in parts for detections in part.detections()]
     ids = np.concatenate([part.image_id for part in parts])
-    write_predictions(file, Predictions.from_detections(found, ids, about, parts[0].dataset, parts[0].fingerprint))
-    shutil.rmtree(folder)
+    predictions = Predictions.from_detections(found, ids, description, parts[0].dataset, parts[0].fingerprint)
+    write_predictions(file, predictions)
+    shutil.rmtree(_parts_folder(file))
 
 
-def _scored(config: SuiteConfig, dataset: Dataset, file: Path) -> Benched:
+def _score_run(config: SuiteConfig, dataset: Dataset, file: Path) -> BenchRun:
     predictions = read_predictions(file)
-    failures = tuple((int(image_id), str(said)) for image_id, said in predictions.detector.get("failures", []))
-    return Benched(config, dataset, file, score(dataset, predictions), failures)
+    failures = tuple((int(image_id), str(message)) for image_id, message in predictions.detector.get("failures", []))
+    return BenchRun(config, dataset, file, score(dataset, predictions), failures)
 
 
 def write_suite_reports(
-    runs: Iterable[Benched], out: str | Path, *, command: Sequence[str] = ()
+    runs: Iterable[BenchRun], out: str | Path, *, command: Sequence[str] = ()
 ) -> tuple[SuiteReport, ...]:
-    """Write a report per suite and a scores file per detector, and return the tables.
+    """Write a report per suite and a scores file per detector, and return their tables.
 
     Parameters
     ----------
-    runs : iterable of Benched
+    runs : iterable of BenchRun
         The result of :func:`bench`.
     out : str or Path
         Folder for ``SUITE.html``, ``SUITE.md`` and ``scores/SUITE/DETECTOR.json``.
     command : sequence of str
         The command line, for the provenance.
 
+    Returns
+    -------
+    tuple of SuiteReport
+
     Raises
     ------
     DataError
         If a file cannot be written.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> suite = kpbench.SuiteConfig(kpbench.load_suite("paper-v1"), images=1, size_px=(203, 155), only=("blur",))
+    >>> runs = kpbench.bench([suite], ["orb"], "bench", workers=1)
+    >>> [report] = kpbench.write_suite_reports(runs, "bench")
+    >>> report.page.as_posix(), report.tables[0].title
+    ('bench/paper-v1.html', 'All images')
     """
     by_suite = groupby(runs, lambda run: run.config.suite.name)
     return tuple(_write_suite_report(suite, tuple(part), Path(out), command) for suite, part in by_suite)
 
 
-def _write_suite_report(suite: str, runs: Sequence[Benched], out: Path, command: Sequence[str]) -> SuiteReport:
+def _write_suite_report(suite: str, runs: Sequence[BenchRun], out: Path, command: Sequence[str]) -> SuiteReport:
     dataset, scores = runs[0].dataset, tuple(run.scores for run in runs)
     provenance = collect_provenance(dataset.path, dataset.fingerprint, [run.predictions for run in runs], command)
     page = out / f"{suite}.html"
     for path in (page, page.with_suffix(".md")):
         write_report(path, Report(scores, dataset.config, provenance=provenance, title=f"{suite}, simulated"))
-    folder = out / "scores" / suite
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = make_folder(out / "scores" / suite)
     for run in runs:
         provenance = collect_provenance(run.dataset.path, run.dataset.fingerprint, [run.predictions], command)
         name = f"{run.predictions.stem.rpartition('-')[0]}.json"

@@ -34,7 +34,15 @@ MOST_CASES = 12
 
 
 class LabelledImages(Protocol):
-    """A dataset as scoring and reports need it: a :class:`kpbench.Dataset`, COCO annotations, or a class of yours."""
+    """A dataset as scoring and reports need it: :class:`kpbench.Dataset`, COCO annotations, or a class of yours.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> dataset: kpbench.LabelledImages = kpbench.open_dataset("kpbench-data")
+    >>> len(dataset.truth), dataset.image(0).shape
+    (6, (480, 640))
+    """
 
     @property
     def path(self) -> Path:
@@ -91,6 +99,13 @@ class ScoredFile:
         Errors of the board's pose; empty unless `pose` was set.
     provenance : dict
         Files, digests and versions behind the numbers.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scored = kpbench.score_file("preds.json")
+    >>> [entry["file"] for entry in scored.provenance["predictions"]]
+    ['preds.json']
     """
 
     scores: Scores
@@ -113,6 +128,13 @@ class ComparedFiles:
         The dataset that all files were scored against.
     provenance : dict
         Files, digests and versions behind the numbers.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> compared = kpbench.compare_files(["preds.json", "preds.json"])
+    >>> [scores.name for scores in compared.scores]  # the file tells detectors of equal names apart
+    ['oracle preds.json', 'oracle preds.json']
     """
 
     comparisons: tuple[Comparison, ...]
@@ -149,7 +171,7 @@ def score_file(
     command : sequence of str
         The command line, for the provenance.
     warn : function
-        Called with a line of text if images of the report or the dataset named by the predictions are missing.
+        Called with a line of text if the images for the report, or the dataset that the predictions name, are missing.
     **options
         The keyword arguments of :func:`kpbench.score`, such as ``eps=0.2``.
 
@@ -163,11 +185,18 @@ def score_file(
         If the predictions cannot be read or do not fit the dataset.
     DataError
         If the dataset cannot be read, `pose` is set and the dataset shows no board, or a file cannot be written.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scored = kpbench.score_file("preds.json", json_file="scores.json", report_file="report.html", eps=0.2)
+    >>> scored.scores["precision"], scored.dataset.path.name
+    (1.0, 'kpbench-data')
     """
     path, (to_json, to_csv, to_report) = Path(predictions), map(_as_path, (json_file, csv_file, report_file))
     _refuse_overwrite([path], [to_json, to_csv], to_report)
     dataset, [scores] = _score_files([path], truth, warn, options)
-    poses = _pose_groups(scores, dataset) if pose else ()
+    poses = _compute_poses(scores, dataset) if pose else ()
     provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
     if to_json:
         write_atomic(to_json, encode_scores(scores, provenance, poses))
@@ -209,6 +238,13 @@ def compare_files(
         If there are fewer than two files.
     PredictionsError, DataError
         As by :func:`score_file`.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> compared = kpbench.compare_files(["preds.json", "preds.json"], json_file="compared.json")
+    >>> compared.comparisons[0].differences[0].verdict
+    'even'
     """
     if len(predictions) < 2:
         raise ValueError(f"{len(predictions)} predictions files, expected two or more")
@@ -241,7 +277,10 @@ def _score_files(
     warn: Callable[[str], None],
     options: ScoreOptions,
 ) -> tuple[LabelledImages, list[Scores]]:
-    """Score all files against the dataset of the first. The file's name tells detectors of equal names apart."""
+    """Score all files against the dataset of the first file.
+
+    Detectors of equal names get the names of their files too.
+    """
     predictions = [read_predictions(path) for path in files]
     dataset = _find_dataset(predictions[0], files[0], truth, warn)
     scores: list[Scores] = []
@@ -273,12 +312,12 @@ def _find_dataset(
     problem = f"names the dataset {named!r}, which is not here" if named else "names no dataset"
     if not DEFAULT_DATASET.exists():
         raise PredictionsError(f"{file}: {problem}, and there is no ./{DEFAULT_DATASET}; name one with `truth`")
-    if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint names a dataset but no place
+    if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint is no path, so nothing is missing
         warn(f"{file} {problem}; scoring against ./{DEFAULT_DATASET}")
     return open_dataset(DEFAULT_DATASET)
 
 
-def _pose_groups(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
+def _compute_poses(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
     from kpbench.synth.suite import board_in_view  # here, because few need it and it loads OpenCV
 
     view = board_in_view(dataset.config)

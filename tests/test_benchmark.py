@@ -8,7 +8,7 @@ import cv2
 import pytest
 from helpers import kpbench
 
-from kpbench.benchmark import bench, images_to_do
+from kpbench.benchmark import bench, count_bench_images
 from kpbench.detectors import interface as detect
 from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
@@ -71,7 +71,7 @@ def test_interrupted_at_three_places_and_resumed_is_the_same(here):
     names = ("mine:corners", "aruco", "mine:frail")
     counted = []
     whole = bench([SMALL], names, "whole", workers=1, progress=counted.append)
-    assert sum(counted) == images_to_do([SMALL], names) == 32 + 8 + 32 + 8 + 32
+    assert sum(counted) == count_bench_images([SMALL], names) == 32 + 8 + 32 + 8 + 32
     for limit in (15, 35, 60):
         with pytest.raises(Stop):
             bench([SMALL], names, "parts", workers=1, progress=stop_after(limit))

@@ -59,7 +59,7 @@ def bench(
       kpbench bench --images 50 --detector my_module:MyDetector --only blur
     """
     from kpbench.benchmark import bench as run_bench
-    from kpbench.benchmark import images_to_do, write_suite_reports
+    from kpbench.benchmark import count_bench_images, write_suite_reports
     from kpbench.cli.progress import progress_bar
     from kpbench.report.tables import to_markdown
     from kpbench.synth.suite import SuiteConfig
@@ -74,14 +74,16 @@ def bench(
         raise click.UsageError(f"suites of one name, {', '.join(s.name for s in loaded)}: their results would be mixed")
     configs = [SuiteConfig(suite, images, seed, size, only, backgrounds) for suite in loaded]
     try:
-        with progress_bar(images_to_do(configs, detectors), "bench") as progress:
+        with progress_bar(count_bench_images(configs, detectors), "bench") as progress:
             runs = run_bench(configs, detectors, out, workers=workers, progress=progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("what is done is kept; the same command goes on") from None
     for report in write_suite_reports(runs, out, command=["kpbench", *sys.argv[1:]]):
         for table in report.tables:
             click.echo(to_markdown(table))
-        click.echo(f"{report.page}: the report of {report.suite}\n{report.scores}: the scores, one file per detector")
+        click.echo(
+            f"{report.page}: the report of {report.suite}\n{report.scores_folder}: the scores, one file per detector"
+        )
     failed = [(run, failure) for run in runs for failure in run.failures]
     if failed:
         for run, (image_id, problem) in failed[:5]:

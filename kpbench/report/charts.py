@@ -25,10 +25,10 @@ svg.chart{font:12px system-ui,sans-serif;color:inherit;width:100%;max-width:600p
 """ + "".join(f".s{n}{{stroke:var(--s{n});fill:var(--s{n})}}" for n in range(CHART_COLOURS))
 """Style sheet (CSS) of all charts of a page."""
 
-# Sizes in units of the drawing; a browser shows the charts at most 600 px wide
-WIDTH, HEIGHT = 480, 300
-LEFT, RIGHT, TOP, BOTTOM = 52, 12, 10, 46
-"""Margins around the plot."""
+# Sizes and positions in units of the drawing; a browser shows a chart at most 600 px wide
+CHART_WIDTH, CHART_HEIGHT = 480, 300
+PLOT_LEFT, PLOT_RIGHT, PLOT_TOP, PLOT_BOTTOM = 52, 468, 10, 254
+"""Edges of the plot; the labels of the axes are outside."""
 BAR_HEIGHT = 26
 """Height of a bar with the gap to the next one."""
 BAR_LABEL_WIDTH = 150
@@ -113,27 +113,27 @@ def line_chart(
 
     def to_px(x: float) -> float:
         a, b, c = (math.log(v) for v in (left, x, right)) if log_x else (left, x, right)
-        return LEFT + (WIDTH - LEFT - RIGHT) * ((b - a) / (c - a) if c > a else 0.5)
+        return PLOT_LEFT + (PLOT_RIGHT - PLOT_LEFT) * ((b - a) / (c - a) if c > a else 0.5)
 
     def to_py(y: float) -> float:
-        return HEIGHT - BOTTOM - (HEIGHT - TOP - BOTTOM) * (min(max(y, low), high) - low) / (high - low)
+        return PLOT_BOTTOM - (PLOT_BOTTOM - PLOT_TOP) * (min(max(y, low), high) - low) / (high - low)
 
     parts = []
     for y in _round_numbers(low, high):
         height = to_py(y)
-        parts.append(f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{height:.1f}" y2="{height:.1f}"/>')
-        parts.append(_text(LEFT - 6, height + 4, f"{y:g}", "end"))
+        parts.append(f'<line class="grid" x1="{PLOT_LEFT}" x2="{PLOT_RIGHT}" y1="{height:.1f}" y2="{height:.1f}"/>')
+        parts.append(_text(PLOT_LEFT - 6, height + 4, f"{y:g}", "end"))
     for x in x_ticks if x_ticks is not None else _round_numbers(left, right):
-        parts.append(_text(to_px(x), HEIGHT - BOTTOM + 18, f"{x:g}", "middle"))
-    parts.append(f'<line class="axis" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{HEIGHT - BOTTOM}" y2="{HEIGHT - BOTTOM}"/>')
-    parts.append(_text((LEFT + WIDTH - RIGHT) / 2, HEIGHT - 8, x_label, "middle"))
-    middle = (TOP + HEIGHT - BOTTOM) / 2
+        parts.append(_text(to_px(x), PLOT_BOTTOM + 18, f"{x:g}", "middle"))
+    parts.append(f'<line class="axis" x1="{PLOT_LEFT}" x2="{PLOT_RIGHT}" y1="{PLOT_BOTTOM}" y2="{PLOT_BOTTOM}"/>')
+    parts.append(_text((PLOT_LEFT + PLOT_RIGHT) / 2, CHART_HEIGHT - 8, x_label, "middle"))
+    middle = (PLOT_TOP + PLOT_BOTTOM) / 2
     parts.append(
         f'<text text-anchor="middle" transform="translate(13 {middle:.1f}) rotate(-90)">{escape(y_label)}</text>'
     )
     for s in series:
         parts += _draw_series(s, to_px, to_py, markers)
-    return _svg(WIDTH, HEIGHT, f"{y_label} over {x_label}: {', '.join(s.name for s in series)}", parts)
+    return _svg(CHART_WIDTH, CHART_HEIGHT, f"{y_label} over {x_label}: {', '.join(s.name for s in series)}", parts)
 
 
 def _draw_series(
@@ -196,7 +196,7 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
     3
     """
     parts = []
-    width = WIDTH - BAR_LABEL_WIDTH - RIGHT
+    width = PLOT_RIGHT - BAR_LABEL_WIDTH
     for n, (name, counts) in enumerate(rows):
         y, x, total = n * BAR_HEIGHT, float(BAR_LABEL_WIDTH), sum(counts)
         parts.append(_text(BAR_LABEL_WIDTH - 8, y + 17, name if len(name) <= 20 else f"{name[:19]}…", "end"))
@@ -208,7 +208,7 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
                 box = f'<rect class="s{style % CHART_COLOURS}" x="{x:.1f}" y="{y + 3}" {size}>'
                 parts.append(f"{box}<title>{escape(text)}</title></rect>")
             x += part_width
-    return _svg(WIDTH, len(rows) * BAR_HEIGHT, f"Shares of {', '.join(kinds)}", parts)
+    return _svg(CHART_WIDTH, len(rows) * BAR_HEIGHT, f"Shares of {', '.join(kinds)}", parts)
 
 
 def _svg(width: float, height: float, label: str, parts: Iterable[str]) -> str:
