@@ -30,10 +30,8 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "printing"))
 import readers
 
-from kpbench.geometry.coverage import rasterise
-from kpbench.geometry.outline import Line, flatten, move
-from kpbench.patches.board import grid_board, hexagon_board
-from kpbench.patches.design import Patch, shipped_patches
+from kpbench.geometry import Line, flatten, move, rasterise
+from kpbench.patches import Patch, grid_board, hexagon_board, shipped_patches
 from kpbench.printing.dxf import to_dxf
 from kpbench.printing.page import Page, Shape
 from kpbench.printing.pdf import to_pdf

@@ -24,7 +24,7 @@ from pathlib import Path
 from torch import nn
 from tqdm import tqdm
 
-from kpbench.patches.design import load_patches, shipped_patches
+from kpbench.patches import load_patches, shipped_patches
 from kpbench.training import crops
 from kpbench.training.loop import train
 from kpbench.training.recipe import Phase, Recipe, load_recipe

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from kpbench.patches.design import shipped_patches
+from kpbench.patches import shipped_patches
 from kpbench.training.batches import load_photos, make_batch
 from kpbench.training.loop import start, step_once, train
 from kpbench.training.recipe import Phase, load_recipe

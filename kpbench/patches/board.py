@@ -1,7 +1,7 @@
-"""Boards: patches at known places in mm, built in (hexagon, grid) or from TOML.
+"""Boards: patches at known places in mm. A board is a hexagon, a grid, or the content of a TOML file.
 
-Board frame: mm, x right, y down, z away from the viewer, the origin is the board's centre
-(:mod:`kpbench.geometry.homography`). ``Board.points_mm`` goes into ``cv2.solvePnP`` as it is.
+Board frame: mm, x right, y down, z away from the viewer. The origin is the board's centre. ``cv2.solvePnP`` takes
+``Board.points_mm`` without conversion.
 """
 
 from __future__ import annotations
@@ -22,47 +22,64 @@ from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.types import Float
 
 TOML_SCHEMA = "kpbench.board-design/1"
-HEXAGON_DIAMETER = 0.16  # of the board's side, from the paper's 16-px patch on a board of 0.5 % of the image
-HEXAGON_CIRCUMRADIUS = 0.36
-GRID_PITCH = 2.0  # disc diameters
+HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side: the paper's 16-px patch on 0.5 % of the image
+HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
+GRID_PITCH = 2.0  # distance of neighbours in a grid whose file names no pitch, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
 BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
 GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
 KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
-SIZE_MM = (0.1, 5000.0)  # least and most that a board's file may ask for, of diameters and pitches
-PLACE_MM = (-25_000.0, 25_000.0)  # likewise, of coordinates
+SIZE_MM = (0.1, 5000.0)  # least and greatest diameter or pitch in a file
+PLACE_MM = (-25_000.0, 25_000.0)  # least and greatest coordinate in a file
+TOUCHING_MM = 1e-6  # patches may overlap by this much, so that rounding does not part patches that touch
 
 
 class BoardPoint(Protocol):
-    """A point on a board and the disc that is its measure, which a patch fills."""
+    """A point on a board, with the disc that gives the point its scale. A patch fills the disc.
+
+    Examples
+    --------
+    >>> from kpbench.patches import BoardPoint, tag_board
+    >>> point: BoardPoint = tag_board("aruco", side_mm=200.0).keypoints[0]
+    >>> point.patch_id
+    0
+    """
 
     @property
     def patch_id(self) -> int:
-        """The identity that detectors report."""
+        """Identity that detectors report."""
         ...
 
     @property
     def H_patch2board(self) -> Float:
-        """Unit disc to mm of the board frame, ndarray of shape (3, 3)."""
+        """Homography from the unit disc to mm of the board frame, ndarray of shape (3, 3)."""
         ...
 
 
 class BoardLike(Protocol):
-    """What :mod:`kpbench.render` needs of a board: a :class:`Board`, or a :class:`kpbench.patches.TagBoard`."""
+    """A board that can be rendered, such as :class:`Board` or :class:`kpbench.patches.TagBoard`.
+
+    Examples
+    --------
+    >>> from kpbench.patches import BoardLike, hexagon_board, shipped_patches, tag_board
+    >>> boards: list[BoardLike] = [hexagon_board(shipped_patches()[0], 200.0), tag_board("charuco", 200.0)]
+    >>> [len(board.keypoints) for board in boards]
+    [6, 6]
+    """
 
     @property
     def side_x_mm(self) -> float:
-        """Width."""
+        """Width of the board."""
         ...
 
     @property
     def side_y_mm(self) -> float:
-        """Height."""
+        """Height of the board."""
         ...
 
     @property
     def keypoints(self) -> Sequence[BoardPoint]:
-        """In the order of their truth."""
+        """Points in the order in which the truth lists them."""
         ...
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
@@ -72,7 +89,25 @@ class BoardLike(Protocol):
 
 @dataclass(frozen=True)
 class BoardKeypoint:
-    """One patch on a board: centre in mm of the board frame, turn from +x towards +y, disc diameter in mm."""
+    """A patch on a board.
+
+    Attributes
+    ----------
+    patch : Patch
+    x_mm, y_mm : float
+        Centre in the board frame.
+    rotate_deg : float
+        Rotation of the patch from +x towards +y.
+    diameter_mm : float
+        Diameter of the disc. Rim and quiet zone lie around the disc.
+
+    Examples
+    --------
+    >>> from kpbench.patches import BoardKeypoint, shipped_patches
+    >>> keypoint = BoardKeypoint(shipped_patches()[2], x_mm=40.0, y_mm=0.0, rotate_deg=90.0, diameter_mm=30.0)
+    >>> keypoint.patch_id, keypoint.extent_mm
+    (2, 15.0)
+    """
 
     patch: Patch
     x_mm: float
@@ -82,17 +117,17 @@ class BoardKeypoint:
 
     @property
     def patch_id(self) -> int:
-        """The identity that detectors report."""
+        """Identity that detectors report."""
         return self.patch.patch_id
 
     @property
     def extent_mm(self) -> float:
-        """Radius of all that belongs to the patch, rim and quiet zone included."""
+        """Outer radius of the patch, rim and quiet zone included."""
         return self.patch.extent * self.diameter_mm / 2
 
     @property
     def H_patch2board(self) -> Float:
-        """Unit disc to mm of the board frame, ndarray of shape (3, 3)."""
+        """Homography from the unit disc to mm of the board frame, ndarray of shape (3, 3)."""
         c, s = (self.diameter_mm / 2 * v for v in cos_sin_deg(self.rotate_deg))
         return np.array([[c, -s, self.x_mm], [s, c, self.y_mm], [0.0, 0.0, 1.0]])
 
@@ -101,11 +136,26 @@ class BoardKeypoint:
 class Board:
     """A rectangle with patches on it.
 
+    Attributes
+    ----------
+    name : str
+    side_x_mm, side_y_mm : float
+        Width and height.
+    keypoints : tuple of BoardKeypoint
+        At least one.
+
     Raises
     ------
     DesignError
-        If it has no keypoint, a patch reaches over its edge, two patches overlap, or two different
-        designs share an id.
+        If the board has no keypoint, a patch reaches over the edge, two patches overlap, or two different designs share
+        an id.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> board = kpbench.grid_board(kpbench.shipped_patches(), rows=2, columns=3, diameter_mm=20.0, pitch_mm=40.0)
+    >>> board.points_mm[:2].tolist()
+    [[-40.0, -20.0, 0.0], [0.0, -20.0, 0.0]]
     """
 
     name: str
@@ -116,18 +166,17 @@ class Board:
     def __post_init__(self) -> None:
         if not self.keypoints:
             raise DesignError(f"board {self.name!r} has no keypoints, expected at least one")
-        slack = 1e-6  # mm: patches that touch are fine whatever the rounding
         x, y, extent = np.array([(k.x_mm, k.y_mm, k.extent_mm) for k in self.keypoints]).T
         for n in range(len(x) - 1):
             gap = np.hypot(x[n + 1 :] - x[n], y[n + 1 :] - y[n]) - extent[n + 1 :] - extent[n]
-            if gap.min() < -slack:
+            if gap.min() < -TOUCHING_MM:
                 m = n + 1 + int(gap.argmin())
                 raise DesignError(
                     f"board {self.name!r}: keypoints {n} and {m} overlap by {-gap.min():.3g} mm, rims and quiet zones "
                     "included"
                 )
         over = np.maximum(abs(x) - self.side_x_mm / 2, abs(y) - self.side_y_mm / 2) + extent
-        if over.max() > slack:
+        if over.max() > TOUCHING_MM:
             n = int(over.argmax())
             raise DesignError(
                 f"board {self.name!r}: keypoint {n} at ({x[n]:g}, {y[n]:g}) mm reaches {over[n]:.3g} mm over "
@@ -140,23 +189,32 @@ class Board:
 
     @property
     def patches(self) -> tuple[Patch, ...]:
-        """The designs on the board, each once, in order of their ids."""
+        """Different designs on the board, in the order of their ids."""
         return tuple(p for _, p in sorted({k.patch.patch_id: k.patch for k in self.keypoints}.items()))
 
     @property
     def points_mm(self) -> Float:
-        """Keypoints in the board frame, ndarray of shape (N, 3) with z = 0."""
+        """Centres of the keypoints in mm of the board frame, ndarray of shape (N, 3) with z = 0."""
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """Outlines as polygons of shape (N, 2) in mm: those of each part of the black ink, and of each keypoint's disc.
+        """Return the outlines of all black ink, and of the discs, as polygons in mm of the board frame.
 
-        Parts do not overlap. Curves are true to a thousandth of a pixel where the radius of keypoint n is
-        ``radius_px[n]``.
+        Parameters
+        ----------
+        radius_px : ndarray of shape (n,)
+            Radius of each keypoint's disc in the image. Polygons deviate from curves by at most 1/1000 px there.
+
+        Returns
+        -------
+        parts : list of lists of ndarray of shape (N, 2)
+            Polygons of each part of the ink. Parts do not overlap; here, each patch is a part.
+        discs : list of lists of ndarray of shape (N, 2)
+            Polygons of each keypoint's disc, rim and quiet zone included.
         """
         parts, discs = [], []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
-            # the tolerance is rounded to a power of two so that polygons are reused
+            # powers of two are few: the cache of unit_polygons then serves many radii
             black, disc = unit_polygons(k.patch, 2.0 ** np.floor(np.log2(1e-3 / radius)))
             parts.append([project(k.H_patch2board, polygon) for polygon in black])
             discs.append([project(k.H_patch2board, polygon) for polygon in disc])
@@ -164,7 +222,7 @@ class Board:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of what is printed and where, to 1 nm; the name does not count."""
+        """SHA-256 of the designs and their places, rounded to 1 nm; the name of the board does not count."""
         lengths: list[tuple[float, ...]] = [(self.side_x_mm, self.side_y_mm)]
         lengths += [(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints]
         patches = [(k.patch.patch_id, k.patch.digest) for k in self.keypoints]
@@ -173,14 +231,28 @@ class Board:
 
 
 def hexagon_board(patch: Patch, side_mm: float) -> Board:
-    """The paper's board: six identical patches on a regular hexagon, the first on the right, then clockwise.
+    """Return the paper's board: six patches of one design on a regular hexagon.
 
-    On a square of side S the discs have a diameter of 0.16 S and their centres a circumradius of 0.36 S.
+    The board is a square of side S. The discs have a diameter of 0.16 S. Their centres have a distance of 0.36 S from
+    the board's centre. The first patch is on the right; the others follow clockwise.
+
+    Parameters
+    ----------
+    patch : Patch
+    side_mm : float
+        Side S of the square.
 
     Raises
     ------
     DesignError
-        If the patch's rim and quiet zone are so wide that patches overlap.
+        If rim and quiet zone are so wide that patches overlap or leave the board.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> board = kpbench.hexagon_board(kpbench.shipped_patches()[0], side_mm=200.0)
+    >>> board.points_mm[0].tolist()
+    [72.0, 0.0, 0.0]
     """
     turns = [cos_sin_deg(60.0 * n) for n in range(6)]
     radius, diameter = HEXAGON_CIRCUMRADIUS * side_mm, HEXAGON_DIAMETER * side_mm
@@ -191,15 +263,32 @@ def hexagon_board(patch: Patch, side_mm: float) -> Board:
 def grid_board(
     patches: Sequence[Patch], rows: int, columns: int, diameter_mm: float, pitch_mm: float, name: str = "grid"
 ) -> Board:
-    """Patches in rows and columns, row by row from the top left.
+    """Return a board with patches in rows and columns, listed row by row from the top left.
 
-    The patch in row r and column c is design ``(r + c) % len(patches)``, so that neighbours differ.
-    The board is ``columns * pitch_mm`` wide and ``rows * pitch_mm`` high.
+    The patch in row r and column c is design ``(r + c) % len(patches)``. Neighbours therefore differ. The board is
+    ``columns * pitch_mm`` wide and ``rows * pitch_mm`` high.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    rows, columns : int
+    diameter_mm : float
+        Diameter of the discs.
+    pitch_mm : float
+        Distance between the centres of neighbours.
+    name : str
 
     Raises
     ------
     DesignError
-        If the patches overlap.
+        If patches overlap.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> board = kpbench.grid_board(kpbench.shipped_patches(), rows=2, columns=2, diameter_mm=20.0, pitch_mm=40.0)
+    >>> [keypoint.patch_id for keypoint in board.keypoints]
+    [0, 1, 1, 2]
     """
     keypoints = tuple(
         BoardKeypoint(
@@ -216,12 +305,24 @@ def grid_board(
 
 
 def find_patch(patches: Sequence[Patch], key: object) -> Patch:
-    """The design with this name or id.
+    """Return the design with a name or an id.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    key : str or int
+        Name, or id as a number or as a text.
 
     Raises
     ------
     DesignError
-        If there is none, or if a name is carried by two.
+        If no design has this name or id, or if two designs have this name.
+
+    Examples
+    --------
+    >>> from kpbench.patches import find_patch, shipped_patches
+    >>> find_patch(shipped_patches(), "wheel").patch_id
+    2
     """
     found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
     if len(found) != 1:
@@ -231,21 +332,31 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
 
 
 def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
-    """Read a board from TOML: either a ``[grid]`` or a list of ``[[keypoint]]``.
+    """Read a board from a TOML file with either a ``[grid]`` or a list of ``[[keypoint]]``.
 
     Parameters
     ----------
-    path : path
+    path : str or Path
     patches : sequence of Patch, optional
-        Designs that the file may name. If left out: those of its own ``designs = [...]`` (paths
-        relative to the file), else the shipped ones.
+        Designs that the file may name. If left out: the designs that the file lists under ``designs`` (paths relative
+        to the file), or else the shipped designs.
     diameter_mm : float, optional
-        Disc diameter where the file sets none; 30 if left out.
+        Diameter of discs for which the file sets none; 30 if left out.
 
     Raises
     ------
     DesignError
-        One line that names the file, the key and what was expected.
+        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. The message
+        names the file, the key and what was expected.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import kpbench
+    >>> _ = Path("mine.toml").write_text("grid = { rows = 2, columns = 3 }")
+    >>> board = kpbench.load_board("mine.toml", diameter_mm=20.0)
+    >>> board.side_x_mm, board.side_y_mm
+    (120.0, 80.0)
     """
     path = Path(path)
     content = read_toml(path, DesignError)
@@ -256,7 +367,7 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
 def parse_board(
     content: Mapping[str, Any], path: Path, patches: Sequence[Patch] | None, diameter_mm: float | None
 ) -> Board:
-    """Build a board from the content of its TOML file, see :func:`load_board`."""
+    """Return the board that the content of a TOML file describes, see :func:`load_board`."""
     table = TomlTable(content, BOARD_KEYS, DesignError)
     table.require_schema(TOML_SCHEMA, optional=True)
     if "designs" in table:

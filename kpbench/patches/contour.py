@@ -1,8 +1,10 @@
-"""The outline of a design's black cells: exact contours of straight lines and arcs."""
+"""Outline of a design's black cells, as exact contours of straight lines and arcs.
+
+A design is a polar chequer of rings and sectors, see :class:`kpbench.patches.Patch`. A *node* is a pair (ring border,
+sector border). All nodes at radius 0 are one node, the centre. A *border* of a cell leads from node to node.
+"""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,22 +12,36 @@ from numpy.typing import NDArray
 from kpbench.geometry.outline import Arc, Contour, Line, Region, cos_sin_deg
 from kpbench.types import Float
 
+Node = tuple[int, int]
+Border = tuple[Node, Node, str]
+"""First node, last node, and a name such as ``line0,3`` or ``arc1,2`` that tells borders between equal nodes apart."""
+
 
 def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Region:
-    """Contours of the black cells: all cell borders, less those that two black cells share."""
+    """Return the contours of the black cells: the borders of all cells without those that two black cells share.
+
+    Parameters
+    ----------
+    radii : ndarray of shape (R + 1,)
+        Borders of the rings, ascending from 0.
+    angles : ndarray of shape (A,)
+        Borders of the sectors in degrees, ascending in [0, 360).
+    black : ndarray of shape (R, A), bool
+        Ink of each cell.
+    """
     rings, sectors = black.shape
     width = np.diff(np.append(angles, angles[0] + 360.0))
-    # A node is (ring border, angle); all nodes at radius 0 are the centre. Borders run so that ink is
-    # on the same side of each, hence one that two black cells share appears once in each direction.
-    borders: dict[tuple[Any, Any, str], float] = {}
+    # The borders of a cell run around the cell in one direction. Two black neighbours therefore give their common
+    # border once in each direction, and both borders cancel.
+    borders: dict[Border, float] = {}  # to the sweep of an arc in degrees, 0 for a line
 
-    def add(start: tuple[int, int], end: tuple[int, int], kind: str, sweep: float) -> None:
+    def add(start: Node, end: Node, kind: str, sweep: float) -> None:
         a = (start[0], 0) if start[0] == 0 else start
         b = (end[0], 0) if end[0] == 0 else end
         if borders.pop((b, a, kind), None) is None:
             borders[a, b, kind] = sweep
 
-    if sectors == 1:  # whole rings: nothing is straight
+    if sectors == 1:  # whole rings have no straight borders
         contours: list[Contour] = []
         for i in range(rings):
             inner, outer = black[i - 1, 0] if i else black[i, 0], black[i, 0]
@@ -47,42 +63,43 @@ def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Reg
     return _chain(borders, radii, angles)
 
 
-def _chain(borders: dict[tuple[Any, Any, str], float], radii: Float, angles: Float) -> Region:
-    """Join directed borders end to start into closed contours."""
-    leaving: dict[Any, list[tuple[Any, Any, str]]] = {}
-    for key in borders:
-        leaving.setdefault(key[0], []).append(key)
+def _chain(borders: dict[Border, float], radii: Float, angles: Float) -> Region:
+    """Join borders into closed contours: each border starts where the border before it ends."""
+    leaving: dict[Node, list[Border]] = {}
+    for border in borders:
+        leaving.setdefault(border[0], []).append(border)
     contours = []
     while leaving:
         first = next(iter(leaving))
-        chain: list[tuple[Any, Any, str]] = []
+        chain: list[Border] = []
         node = first
         while True:
             choices = leaving[node]
-            chain.append(choices.pop(_turn(chain[-1], choices, angles) if chain else 0))
+            chain.append(choices.pop(_next_border(chain[-1], choices, angles) if chain else 0))
             if not choices:
                 del leaving[node]
             node = chain[-1][1]
             if node == first:
                 break
-        contours.append(_merge([_segment(key, borders[key], radii, angles) for key in chain]))
+        contours.append(_merge([_segment(border, borders[border], radii, angles) for border in chain]))
     return tuple(contours)
 
 
-def _turn(arrived: tuple[Any, Any, str], choices: list[tuple[Any, Any, str]], angles: Float) -> int:
-    """Which border to follow where black cells touch at a point: the one that stays on the same cell.
+def _next_border(arriving: Border, choices: list[Border], angles: Float) -> int:
+    """Return the index of the border that belongs to the same cell, where black cells touch at a point.
 
-    At the centre, ink lies clockwise of a leaving edge and anticlockwise of an arriving one, so the
-    same sector's leaving edge is the nearest one anticlockwise of the arriving edge.
+    Outside the centre, a cell turns from a line to an arc or from an arc to a line. At the centre, the ink lies
+    clockwise of a leaving line and anticlockwise of an arriving line. The line that leaves along the same sector is
+    therefore the nearest line anticlockwise of the arriving line.
     """
-    if arrived[1][0] != 0 or len(choices) == 1:
-        return next((n for n, c in enumerate(choices) if c[2][:3] != arrived[2][:3]), 0)
-    came = angles[arrived[0][1]]
-    return int(np.argmin([(came - angles[c[1][1]] - 1e-9) % 360.0 for c in choices]))
+    if arriving[1][0] != 0 or len(choices) == 1:
+        return next((n for n, c in enumerate(choices) if c[2][:3] != arriving[2][:3]), 0)
+    arrival_angle = angles[arriving[0][1]]
+    return int(np.argmin([(arrival_angle - angles[c[1][1]] - 1e-9) % 360.0 for c in choices]))
 
 
-def _segment(key: tuple[Any, Any, str], sweep: float, radii: Float, angles: Float) -> Line | Arc:
-    (i, j), (k, m), kind = key
+def _segment(border: Border, sweep: float, radii: Float, angles: Float) -> Line | Arc:
+    (i, j), (k, m), kind = border
     if kind.startswith("arc"):
         return Arc(0.0, 0.0, float(radii[i]), float(angles[j]), float(sweep))
     (c0, s0), (c1, s1) = cos_sin_deg(float(angles[j])), cos_sin_deg(float(angles[m]))
@@ -91,8 +108,8 @@ def _segment(key: tuple[Any, Any, str], sweep: float, radii: Float, angles: Floa
 
 
 def _merge(contour: list[Line | Arc]) -> Contour:
-    """Join arcs that continue each other; a line through the centre keeps the centre as a vertex."""
-    for _ in contour:  # start where a new arc starts, so that no arc is split by the contour's start
+    """Join arcs that continue each other. Lines that meet at the centre are not joined."""
+    for _ in contour:  # rotate the contour until its first arc does not continue its last arc
         if isinstance(contour[0], Arc) and isinstance(contour[-1], Arc) and _continues(contour[-1], contour[0]):
             contour = contour[1:] + contour[:1]
     merged: list[Line | Arc] = []

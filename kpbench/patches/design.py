@@ -1,9 +1,8 @@
-"""Patch designs: TOML in, frozen :class:`Patch` out, with its exact outline.
+"""Designs of patches: read from TOML, and turned into exact outlines.
 
-A patch is a disc of radius 1 in one ink, on which semi-circles that share its centre are painted one
-after the other, each in black, white, or inverting what lies below. What results is always a polar
-chequer: rings between the radii, sectors between the angles, each cell black or white
-(:meth:`Patch.cells`). Everything else (outline, ink at a point) is read off those cells.
+A patch is a disc of radius 1 with one ink. Semi-circles about the same centre are painted onto the disc one after the
+other. A semi-circle is black, white, or inverts the ink below. The result is always a polar chequer
+(:attr:`Patch.cells`): rings between the radii, sectors between the angles, and each cell is black or white.
 """
 
 from __future__ import annotations
@@ -33,7 +32,24 @@ PATCH_KEYS = ("schema", "name", "id", "disc", "semicircles", "rim", "quiet_zone"
 
 @dataclass(frozen=True)
 class SemiCircle:
-    """Half a disc about the shared centre: the angles from ``start_deg`` to ``start_deg + 180``."""
+    """Half of a disc about the centre of the patch.
+
+    Attributes
+    ----------
+    radius : float
+        As a fraction of the disc's radius.
+    start_deg : float
+        The semi-circle spans the angles from ``start_deg`` to ``start_deg + 180``, from +u towards +v.
+    ink : str
+        "black", "white" or "invert".
+
+    Examples
+    --------
+    >>> from kpbench.patches import Patch, SemiCircle
+    >>> right_half = SemiCircle(radius=1.0, start_deg=-90.0, ink="black")
+    >>> bool(Patch("half", 9, "white", (right_half,)).is_black([0.5, 0.0]))
+    True
+    """
 
     radius: float
     start_deg: float
@@ -42,23 +58,30 @@ class SemiCircle:
 
 @dataclass(frozen=True)
 class Patch:
-    """One keypoint patch, in the patch frame (unit disc, u right, v down, angles clockwise).
+    """A design in the patch frame: the disc has radius 1, u right, v down, angles from +u towards +v.
 
     Attributes
     ----------
     name : str
     patch_id : int
-        The identity that detectors report.
+        Identity that detectors report.
     disc : str
         Ink of the disc below the semi-circles, "black" or "white".
     semicircles : tuple of SemiCircle
-        Painted in order.
+        Painted in this order.
     rim : float
         Width of a ring around the disc, as a fraction of the disc's radius; 0 for none.
     rim_ink : str
-        "black" or "white".
+        Ink of the rim, "black" or "white".
     quiet_zone : float
-        Width of a white ring outside the rim, as a fraction of the disc's radius.
+        Width of a white ring around the rim, as a fraction of the disc's radius; 0 for none.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> checker = kpbench.shipped_patches()[0]
+    >>> checker.name, checker.extent, checker.centre_is_crossing
+    ('checker', 1.0, True)
     """
 
     name: str
@@ -71,17 +94,19 @@ class Patch:
 
     @property
     def extent(self) -> float:
-        """Radius of all that belongs to the patch, rim and quiet zone included, in disc radii."""
+        """Outer radius in disc radii, rim and quiet zone included."""
         return 1.0 + self.rim + self.quiet_zone
 
     @cached_property
     def cells(self) -> tuple[Float, Float, NDArray[np.bool_]]:
-        """The polar chequer: (radii, angles_deg, black).
+        """The polar chequer (radii, angles_deg, black).
 
-        ``radii`` of shape (R + 1,) starts at 0; ``angles_deg`` of shape (A,) is sorted in [0, 360);
-        ``black[i, j]`` says whether the cell between radii i and i + 1 and between angles j and
-        j + 1 (cyclic) is black. Borders between cells of equal ink are already removed where they
-        run through all sectors or all rings.
+        * ``radii``, ndarray of shape (R + 1,): borders of the rings, ascending from 0.
+        * ``angles_deg``, ndarray of shape (A,): borders of the sectors, ascending in [0, 360).
+        * ``black``, ndarray of shape (R, A), bool: ink of the cell between the radii i and i + 1 and between the angles
+          j and j + 1. The last sector ends at the first angle.
+
+        The chequer is the coarsest of its kind: every border separates black from white somewhere.
         """
         radii = np.unique([0.0, 1.0, *(s.radius for s in self.semicircles)])
         angles = np.unique(np.round([(s.start_deg + a) % 360.0 for s in self.semicircles for a in (0, 180)], 9))
@@ -106,7 +131,10 @@ class Patch:
         return radii, angles, black
 
     def is_black(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Ink at points of the patch frame, shape (..., 2) to (...); outside the patch is white."""
+        """Return the ink at points of the patch frame, from shape (..., 2) to shape (...), bool.
+
+        Points outside the patch are white.
+        """
         u, v = np.moveaxis(np.asarray(points, np.float64), -1, 0)
         radii, angles, black = self.cells
         ring = np.searchsorted(radii, np.hypot(u, v), side="right") - 1
@@ -116,20 +144,20 @@ class Patch:
 
     @cached_property
     def black_region(self) -> Region:
-        """Exact outline of all black ink: cells that touch along an edge are merged, so no seams."""
+        """Exact outline of all black ink, without seams: cells that share an edge are merged."""
         return trace_contours(*self.cells)
 
     @property
     def disc_region(self) -> Region:
-        """Exact outline of the whole patch, rim and quiet zone included."""
+        """Exact outline of the patch, rim and quiet zone included."""
         return circle(0.0, 0.0, self.extent)
 
     @property
     def centre_is_crossing(self) -> bool:
         """Whether straight edges of at least two directions meet at the centre.
 
-        Such a centre is the meeting point of image lines under any perspective; one edge alone
-        leaves the centre loose along itself, and a centre of arcs only is biased under tilt.
+        Straight edges stay straight under every perspective. Two directions therefore mark the centre exactly. Edges of
+        one direction leave the centre undetermined along the edge. Arcs alone mark a point that is biased under tilt.
         """
         _, angles, black = self.cells
         edges = angles[black[0] != np.roll(black[0], 1)]
@@ -137,13 +165,13 @@ class Patch:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the ink itself: designs that print alike have the same digest."""
+        """SHA-256 of the ink: designs whose prints are identical have the same digest."""
         radii, angles, black = self.cells
         content = (np.round(radii, 9).tolist(), np.round(angles, 9).tolist(), black.astype(int).tolist())
         return hashlib.sha256(repr(content).encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
-        """The design as its TOML table; ``parse_patch(patch.to_dict(), ...)`` gives it back."""
+        """Return the design as the content of its TOML file, the inverse of :func:`parse_patch`."""
         table: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "id": self.patch_id, "disc": self.disc}
         table["semicircles"] = [{"radius": s.radius, "start_deg": s.start_deg, "ink": s.ink} for s in self.semicircles]
         if self.rim:
@@ -155,17 +183,20 @@ class Patch:
 
 @lru_cache(maxsize=256)
 def unit_polygons(patch: Patch, tolerance: float) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """(black, whole patch) as polygons of the patch frame, see :func:`kpbench.geometry.outline.flatten`."""
+    """Return the polygons of the black ink, and those of the whole patch, in the patch frame.
+
+    ``tolerance`` is that of :func:`kpbench.geometry.flatten`, in disc radii.
+    """
     return tuple(flatten(patch.black_region, tolerance)), tuple(flatten(patch.disc_region, tolerance))
 
 
 def parse_patch(content: Mapping[str, Any], source: str) -> Patch:
-    """Build a patch from its TOML table.
+    """Return the patch that the content of a TOML file describes.
 
     Raises
     ------
     DesignError
-        One line that names ``source``, the key and what was expected.
+        If a key is unknown or a value is wrong. The message names ``source``, the key and what was expected.
     """
     with name_source(source, DesignError):
         table = TomlTable(content, PATCH_KEYS, DesignError)
@@ -190,23 +221,47 @@ def parse_patch(content: Mapping[str, Any], source: str) -> Patch:
 
 
 def load_patch(path: str | Path) -> Patch:
-    """Read one design file.
+    """Read one design.
 
     Raises
     ------
     DesignError
-        If it cannot be read, is no TOML, or is no design.
+        If the file cannot be read, is no TOML, or describes no design.
     """
     return parse_patch(read_toml(path, DesignError), str(path))
 
 
 def load_patches(paths: Sequence[str | Path]) -> tuple[Patch, ...]:
-    """Read several design files, in order of their ids; a folder stands for the .toml files in it.
+    """Read designs from TOML files.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        Files, or folders whose .toml files are read.
+
+    Returns
+    -------
+    tuple of Patch
+        In the order of their ids.
 
     Raises
     ------
     DesignError
-        As :func:`load_patch`, or if two designs share an id, or if a folder holds none.
+        If a file cannot be read, has an unknown key or a wrong value, two designs share an id, or a folder holds no
+        design. The message names the file, the key and what was expected.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import kpbench
+    >>> text = '''
+    ... name = "half"
+    ... id = 7
+    ... semicircles = [{ start_deg = 0, ink = "black" }]
+    ... '''
+    >>> _ = Path("half.toml").write_text(text)
+    >>> [patch.name for patch in kpbench.load_patches(["half.toml"])]
+    ['half']
     """
     patches: dict[int, tuple[str | Path, Patch]] = {}
     for path in itertools.chain.from_iterable(map(_design_files, paths)):
@@ -229,5 +284,12 @@ def _design_files(path: str | Path) -> list[Path]:
 
 @lru_cache(maxsize=1)
 def shipped_patches() -> tuple[Patch, ...]:
-    """The four designs that ship with kpbench, in order of their ids."""
+    """Return the four designs that ship with kpbench, in the order of their ids.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> [patch.name for patch in kpbench.shipped_patches()]
+    ['checker', 'trefoil', 'wheel', 'mushroom']
+    """
     return load_patches([shipped_folder("patches")])

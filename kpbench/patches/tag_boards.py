@@ -1,7 +1,7 @@
-"""Boards of tags - ArUco, AprilTag, ChArUco - whose corners are keypoints, for the same scenes as boards of patches.
+"""Boards of tags (ArUco, AprilTag, ChArUco) whose corners are keypoints, for the same scenes as boards of patches.
 
-Such a board is a square of black and white modules with one white module around. It has at least the six
-keypoints of :func:`kpbench.patches.hexagon_board`, and its tags are as large as the board's side lets them be.
+A tag board is a square of black and white modules with a border of one white module. It has at least six keypoints,
+as :func:`kpbench.patches.hexagon_board` has. The tags are as large as the square permits.
 """
 
 from __future__ import annotations
@@ -24,14 +24,32 @@ DICTIONARIES = {
     "apriltag": cv2.aruco.DICT_APRILTAG_36h11,
     "charuco": cv2.aruco.DICT_4X4_50,
 }
-TAGS_PER_BOARD = 2  # on a diagonal: eight corners, and four tags would be no smaller
-CHARUCO_SQUARES = (4, 3)  # six corners inside
-SQUARE_MODULES, MARKER_MODULES = 8, 6  # modules of a ChArUco square and of the marker in it
+TAGS_PER_BOARD = 2  # on a diagonal, with eight corners together
+CHARUCO_SQUARES = (4, 3)  # columns and rows, with six inner corners
+SQUARE_MODULES, MARKER_MODULES = 8, 6  # side of a ChArUco square, and of the marker within the square, in modules
 
 
 @dataclass(frozen=True)
 class TagCorner:
-    """A keypoint of a tag board, mm; the circle about it is what a patch's disc is: the measure of ε."""
+    """A corner of a tag board as a keypoint.
+
+    The circle about the corner takes the role of a patch's disc: the tolerance ε is a fraction of its radius.
+
+    Attributes
+    ----------
+    patch_id : int
+        Identity that detectors report.
+    x_mm, y_mm : float
+        Place in the board frame.
+    diameter_mm : float
+        Diameter of the circle.
+
+    Examples
+    --------
+    >>> from kpbench.patches import tag_board
+    >>> tag_board("aruco", side_mm=150.0).keypoints[4]
+    TagCorner(patch_id=4, x_mm=5.0, y_mm=5.0, diameter_mm=24.0)
+    """
 
     patch_id: int
     x_mm: float
@@ -40,22 +58,30 @@ class TagCorner:
 
     @property
     def H_patch2board(self) -> Float:
-        """Unit disc to mm of the board frame, ndarray of shape (3, 3)."""
+        """Homography from the unit disc to mm of the board frame, ndarray of shape (3, 3)."""
         radius = self.diameter_mm / 2
         return np.array([[radius, 0.0, self.x_mm], [0.0, radius, self.y_mm], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
 class TagBoard:
-    """A square of modules, mm.
+    """A square of black and white modules.
 
     Attributes
     ----------
     name : str
+        "aruco", "apriltag" or "charuco".
     side_x_mm, side_y_mm : float
+        Width and height, which are equal.
     keypoints : tuple of TagCorner
     black : ndarray of shape (n, n), bool
-        The modules of the whole board, row by row.
+        Modules of the whole board, row by row.
+
+    Examples
+    --------
+    >>> from kpbench.patches import tag_board
+    >>> tag_board("apriltag", side_mm=200.0).black.shape
+    (19, 19)
     """
 
     name: str
@@ -65,7 +91,7 @@ class TagBoard:
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """As :meth:`kpbench.patches.Board.outlines`; all ink is one part."""
+        """Return the outlines as :meth:`kpbench.patches.Board.outlines` does; all ink is a single part."""
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
         ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]
@@ -76,7 +102,7 @@ class TagBoard:
         return [ink], discs
 
     def to_dict(self) -> dict[str, Any]:
-        """What is written into a dataset's config."""
+        """Return the entry that describes the board in the configuration of a dataset."""
         return {
             "name": self.name,
             "side_mm": self.side_x_mm,
@@ -86,33 +112,47 @@ class TagBoard:
 
 
 def tag_dictionary(board: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a board's tags."""
+    """Return OpenCV's dictionary of the tags of a board."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARIES[board])
 
 
 def charuco_pattern() -> cv2.aruco.CharucoBoard:
-    """The ChArUco pattern in OpenCV's own words, lengths in modules."""
+    """Return the ChArUco pattern as OpenCV's object, with lengths in modules."""
     return cv2.aruco.CharucoBoard(CHARUCO_SQUARES, SQUARE_MODULES, MARKER_MODULES, tag_dictionary("charuco"))
 
 
 @lru_cache
 def tag_board(name: str, side_mm: float) -> TagBoard:
-    """One of :data:`TAG_BOARDS` on a square of a given side.
+    """Return a board of tags on a square.
 
-    ``aruco`` and ``apriltag`` carry tags 0 and 1; corner c of tag t, clockwise from its top left, is keypoint
-    4 t + c. ``charuco`` has the six inner corners of 4 x 3 squares, numbered as OpenCV does.
+    ``aruco`` and ``apriltag`` carry the tags 0 and 1. Corner c of tag t is keypoint 4 t + c; the corners of a tag run
+    clockwise from its top left. ``charuco`` has the six inner corners of 4 x 3 squares in OpenCV's order.
+
+    Parameters
+    ----------
+    name : str
+        "aruco" (dictionary 4x4_50), "apriltag" (36h11) or "charuco" (4x4_50).
+    side_mm : float
+        Side of the square.
+
+    Examples
+    --------
+    >>> from kpbench.patches import tag_board
+    >>> [len(tag_board(name, 200.0).keypoints) for name in ("aruco", "apriltag", "charuco")]
+    [8, 8, 6]
     """
     black, corners = _charuco() if name == "charuco" else _two_tags(name)
     module_mm = side_mm / len(black)
-    at_mm = (np.array(list(corners.values())) - len(black) / 2) * module_mm
+    corners_mm = (np.array(list(corners.values())) - len(black) / 2) * module_mm
     keypoints = tuple(
-        TagCorner(n, float(x), float(y), HEXAGON_DIAMETER * side_mm) for n, (x, y) in zip(corners, at_mm, strict=True)
+        TagCorner(n, float(x), float(y), HEXAGON_DIAMETER * side_mm)
+        for n, (x, y) in zip(corners, corners_mm, strict=True)
     )
     return TagBoard(name, side_mm, side_mm, keypoints, black)
 
 
 Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
-"""The board's modules, and its keypoints by id: columns and rows of modules from the top left."""
+"""Modules of a board, and each keypoint's id with its column and row of modules from the top left."""
 
 
 def _two_tags(name: str) -> Modules:
