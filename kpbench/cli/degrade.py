@@ -41,17 +41,12 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     import json
 
     from kpbench.cli.progress import progress_bar
-    from kpbench.degrade.own_images import degrade_files
-    from kpbench.errors import DataError
-    from kpbench.images import open_images, refuse_same_folder
+    from kpbench.degrade.own_images import degrade_files, open_own_images
 
     if len(effects) != len(levels):
         raise click.UsageError(f"{len(effects)} --effect and {len(levels)} --level, expected one level for each effect")
     steps = tuple(zip(effects, levels, strict=True))
-    if (source / "dataset.json").exists():
-        raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
-    refuse_same_folder(source, out)
-    images = open_images(str(source), exclude=out)
+    images = open_own_images(source, out)
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):
             click.echo(f"{path} {json.dumps(applied)}")

@@ -11,13 +11,43 @@ from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import apply_effects, draw_effect
 from kpbench.errors import DataError
 from kpbench.files import make_folder, write_atomic
-from kpbench.images import ImageSource, encode_png
+from kpbench.images import ImageSource, encode_png, open_images, refuse_same_folder
 from kpbench.seeds import stream
 from kpbench.types import UInt8
 
 
+def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
+    """Open an image, a folder of images or a video that is to be degraded into a folder ``out``.
+
+    Images that an earlier run wrote into ``out`` are left out, where that folder lies below the folder of the images.
+
+    Returns
+    -------
+    ImageSource
+        For :func:`degrade_files`.
+
+    Raises
+    ------
+    DataError
+        If the source cannot be opened or is a dataset, or if ``out`` holds the images themselves.
+
+    Examples
+    --------
+    >>> import cv2, numpy as np
+    >>> import kpbench
+    >>> cv2.imwrite("wall.png", np.full((30, 40), 90, np.uint8))
+    True
+    >>> kpbench.degrade.open_own_images("wall.png", "degraded").length
+    1
+    """
+    if (Path(source) / "dataset.json").exists():
+        raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
+    refuse_same_folder(source, Path(out))
+    return open_images(str(source), exclude=Path(out))
+
+
 def degrade_files(
-    source: ImageSource, out: Path, steps: Sequence[tuple[str, float]], seed: int = 0
+    source: ImageSource, out: str | Path, steps: Sequence[tuple[str, float]], seed: int = 0
 ) -> Iterator[tuple[Path, list[Effect]]]:
     """Degrade images one by one and write each as PNG, under its own name and in its own subfolder of ``out``.
 
@@ -26,8 +56,8 @@ def degrade_files(
     Parameters
     ----------
     source : ImageSource
-        From :func:`kpbench.images.open_images`.
-    out : Path
+        From :func:`open_own_images`.
+    out : str or Path
         Folder; made if missing. It must not be the folder of the images.
     steps : sequence of (str, float)
         Effect and level of :data:`kpbench.degrade.LADDER`, applied in order.
@@ -49,12 +79,10 @@ def degrade_files(
     Examples
     --------
     >>> import cv2, numpy as np
-    >>> from pathlib import Path
-    >>> from kpbench.degrade import degrade_files
-    >>> from kpbench.images import open_images
+    >>> from kpbench.degrade import degrade_files, open_own_images
     >>> cv2.imwrite("wall.png", np.full((30, 40), 90, np.uint8))
     True
-    >>> for path, effects in degrade_files(open_images("wall.png"), Path("degraded"), [("blur", 7)]):
+    >>> for path, effects in degrade_files(open_own_images("wall.png", "degraded"), "degraded", [("blur", 7)]):
     ...     print(path, effects)
     degraded/wall.png [{'effect': 'blur', 'kernel_px': 7}]
     """
@@ -67,7 +95,7 @@ def degrade_files(
         rng = stream(seed, n, 0)
         effects = [draw_effect(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
         image = apply_effects(image, rng, effects)
-        target = out / name if name.endswith(".png") else out / f"{name}.png"
+        target = Path(out, name if name.endswith(".png") else f"{name}.png")
         make_folder(target.parent)
         write_atomic(target, encode_png(image))
         yield target, effects
