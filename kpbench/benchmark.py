@@ -25,7 +25,7 @@ from kpbench.dataset.folder import MANIFEST, Dataset, open_dataset
 from kpbench.dataset.generation import generate
 from kpbench.dataset.shard import canonical_json
 from kpbench.detectors.interface import LoadedDetector, load_detector
-from kpbench.detectors.prediction import detect_some
+from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
 from kpbench.files import make_folder, require_own_folder, write_atomic
 from kpbench.patches.design import shipped_patches
@@ -249,7 +249,7 @@ def _detect_parts(parts: Sequence[_Part], workers: int | None, progress: Progres
 def _detect_part(part: _Part, progress: Progress) -> None:
     dataset = _open_once(part.dataset)
     images = range(part.first, part.first + part.count)
-    found = detect_some(dataset, part.detector, None, images, progress)
+    found = detect_images(dataset, part.detector, None, images, progress)
     ids = [int(dataset.truth.image_id[n]) for n in images]
     failures = [[image_id, found[n][1]] for n, image_id in zip(images, ids, strict=True) if found[n][1]]
     detections, description = [found[n][0] for n in images], part.description | _describe_failures(failures)

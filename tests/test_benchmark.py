@@ -86,7 +86,7 @@ def test_interrupted_at_three_places_and_resumed_is_the_same(here):
 
 def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, monkeypatch):
     bench([SMALL], ["mine:corners"], "out", workers=1)
-    monkeypatch.setattr("kpbench.benchmark.detect_some", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.detect_images", lambda *a: pytest.fail("looked again"))
     monkeypatch.setattr("kpbench.benchmark.generate", lambda *a, **k: pytest.fail("made again"))
     bench([SMALL], ["mine:corners"], "out", workers=1)
     commented = DETECTOR + "# another comment\n"
@@ -99,7 +99,7 @@ def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, mon
 
 def test_a_detector_without_a_version_looks_again_each_time(here, monkeypatch):
     bench([SMALL], ["mine:frail"], "out", workers=1)
-    monkeypatch.setattr("kpbench.benchmark.detect_some", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.detect_images", lambda *a: pytest.fail("looked again"))
     with pytest.raises(pytest.fail.Exception, match="looked again"):
         bench([SMALL], ["mine:frail"], "out", workers=1)
 

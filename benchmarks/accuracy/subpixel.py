@@ -3,14 +3,14 @@
     python benchmarks/accuracy/subpixel.py DATASET --backgrounds photos/ [--minutes 10] [--images 200]
 
 pixel      the most probable pixel around the maximum
-mean       the centre of mass of the probability, across the borders of cells (``superpoint.locate``)
+mean       the centre of mass of the probability, across the borders of cells (``kpbench.detectors.decode``)
 refiner    the mean, moved by a small network that sees 24x24 px around it; it is trained first, for --minutes, on
            the crops that ``kpbench train`` makes, from --backgrounds
-fit        the design, fitted to the pixels from there (``verify.examine``)
+fit        the design, fitted to the pixels from the mean on (``kpbench.detectors.verify_candidates``)
 
 Recall is the same for all: every keypoint counts that has a candidate of the network within half its short
-semi-axis, with the candidate that is nearest. Prints the error (px), the share within ε = 0.1 of the radius, and the
-time a candidate on one thread. DATASET must come from other photographs than --backgrounds.
+semi-axis, with the nearest candidate. Prints the error (px), the share within ε = 0.1 of the radius, and the time per
+candidate on one thread. DATASET must come from other photographs than --backgrounds.
 """
 
 from __future__ import annotations
@@ -26,16 +26,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 import kpbench
-from kpbench.detectors import verification as verify
-from kpbench.detectors.superpoint import (
-    CANDIDATE,
-    Decoding,
-    SmallSuperPointDetector,
-    identify,
-    keypoint_probability,
-    locate,
-)
-from kpbench.training.batches import SampleConfig, load_photos, make_batch
+from kpbench.detectors import SmallSuperPointDetector, keypoint_probability, verify_candidates
+from kpbench.training import SampleConfig, load_photos, make_batch
 from kpbench.types import Float, UInt8
 from kpbench.workers import use_one_thread
 
@@ -105,20 +97,19 @@ def main() -> None:
     use_one_thread()
     torch.set_num_threads(1)
     network = trained(options.backgrounds, options.minutes)
-    dataset, detector = kpbench.open_dataset(options.dataset), SmallSuperPointDetector(threads=1)
+    dataset, detector = kpbench.open_dataset(options.dataset), SmallSuperPointDetector(threads=1, scales=(1.0,))
     errors: dict[str, list[Float]] = {name: [] for name in ("pixel", "mean", "refiner", "fit")}
     seconds, candidates = dict.fromkeys(errors, 0.0), 0
     radii, total = list[Float](), 0
     for n in range(min(options.images, len(dataset))):
         grey, keypoints = dataset[n]
         total += len(keypoints)
-        detector_logits, id_logits = (head[0] for head in detector.heads([grey]))
-        xy, score = locate(detector_logits, Decoding(CANDIDATE))
+        xy, score, log_id = detector.candidates([grey])[0]
         if not len(xy) or not len(keypoints):
             continue
         found = {"mean": xy}
         clock = time.perf_counter()
-        found["pixel"] = highest(keypoint_probability(detector_logits), xy)
+        found["pixel"] = highest(keypoint_probability(detector.heads([grey])[0][0]), xy)
         seconds["pixel"] += time.perf_counter() - clock
         clock = time.perf_counter()
         corner = corners(xy)
@@ -126,9 +117,9 @@ def main() -> None:
             found["refiner"] = corner + (SIDE - 1) / 2 + network(windows(grey, corner)).numpy().astype(np.float64)
         seconds["refiner"] += time.perf_counter() - clock
         clock = time.perf_counter()
-        examined = verify.examine(grey, xy, score, identify(id_logits, xy), detector.patches)
+        verified = verify_candidates(grey, xy, score, log_id, detector.patches)
         found["fit"] = xy.copy()
-        found["fit"][examined.place] = examined.xy
+        found["fit"][verified.place] = verified.xy
         seconds["fit"] += time.perf_counter() - clock
         candidates += len(xy)
         truth = np.column_stack([keypoints["x"], keypoints["y"]])

@@ -20,17 +20,15 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 from torch import nn
 from tqdm import tqdm
 
-from kpbench.patches import load_patches, shipped_patches
-from kpbench.training import crops
-from kpbench.training.loop import train
-from kpbench.training.recipe import Phase, Recipe, load_recipe
+from kpbench import load_patches, shipped_patches
+from kpbench.training import Phase, Recipe, load_recipe, train
 from kpbench.workers import count_cores, use_one_thread
 
-CONFIGS = Path(__file__).parents[2] / "configs"
 RUNNER_UP = Path(__file__).parents[1] / "designs" / "runner-up"
 
 
@@ -48,13 +46,12 @@ def _no_deterioration(recipe: Recipe) -> Recipe:
 
 
 def _no_lookalikes(recipe: Recipe) -> Recipe:
-    crops.draw_lookalikes = lambda *_: None
+    mock.patch("kpbench.training.crops.draw_lookalikes").start()
     return recipe
 
 
 def _one_scale(recipe: Recipe) -> Recipe:
-    crops.VIEWS.clear()
-    crops.VIEWS[1.0] = 1.0
+    mock.patch.dict("kpbench.training.crops.VIEWS", {1.0: 1.0}, clear=True).start()
     return recipe
 
 
@@ -65,7 +62,7 @@ def _no_batch_norm(recipe: Recipe) -> Recipe:
 
 def _papers(recipe: Recipe) -> Recipe:
     """Its network takes ten times as long a crop, so that it sees a tenth of the crops in about the same time."""
-    paper = load_recipe(CONFIGS / "paper.toml")
+    paper = load_recipe("paper")
     phase = replace(recipe.phases[0], samples=recipe.phases[0].samples // 10)
     return replace(recipe, network=paper.network, loss=paper.loss, phases=(phase,), warmup=recipe.warmup // 10)
 
@@ -85,7 +82,7 @@ VARIANTS: dict[str, Callable[[Recipe], Recipe]] = {
 def run(name: str, backgrounds: Path, samples: int) -> dict[str, float]:
     """The last validation of one variant."""
     use_one_thread()
-    recipe = load_recipe(CONFIGS / "reference.toml")
+    recipe = load_recipe("reference")
     phase = Phase(samples, severity=(0.0, 0.5))
     recipe = replace(recipe, precision="bf16", seed=3, warmup=samples // 10, phases=(phase,))
     recipe = VARIANTS[name](recipe)

@@ -18,10 +18,9 @@ import numpy as np
 import torch
 
 import kpbench
-from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
+from kpbench.detectors import SmallSuperPointDetector, SuperPointDetector
 from kpbench.images import resize, to_grey
-from kpbench.training.network import SuperPoint
-from kpbench.training.recipe import NetworkConfig
+from kpbench.training import NetworkConfig, SuperPoint
 
 
 def main() -> None:

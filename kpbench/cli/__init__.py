@@ -25,12 +25,12 @@ COMMANDS = {
     "verify": ("dataset:verify", "Compare every byte of a dataset with its manifest."),
     "preview": ("dataset:preview", "Draw a contact sheet with the true keypoints."),
     "export": ("dataset:export", "Write a dataset as COCO, YOLO-pose or WebDataset."),
-    "detect": ("detecting:detect", "Run a detector over a dataset or image files."),
+    "detect": ("detect:detect", "Run a detector over a dataset or image files."),
     "score": ("score:score", "Score a predictions file with the paper's metrics."),
     "compare": ("compare:compare", "Compare detectors on the same images, pair by pair."),
     "bench": ("benchmark:bench", "Make suites, run detectors, score them beside the paper."),
-    "train": ("training:train", "Train the detector; needs kpbench[train]."),
-    "export-model": ("training:export_model", "Write trained weights as an ONNX file."),
+    "train": ("train:train", "Train the detector, or its verifier; needs kpbench[train]."),
+    "export-model": ("train:export_model", "Write trained weights as an ONNX file."),
     "demo": ("demo:demo", "Run the whole chain with few images, in about a minute."),
 }
 

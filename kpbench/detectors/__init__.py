@@ -1,1 +1,9 @@
-"""The detectors that ship with kpbench; :func:`kpbench.detectors.load_detector` knows them by name."""
+"""Detectors: the interface, the detectors that ship, and running them over datasets and images.
+
+A detector is a function of an image, or an object with a method ``detect``; both return
+:class:`kpbench.Detections`. :func:`load_detector` loads one by name.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,4 +1,4 @@
-"""What runs a network of an ONNX file: ONNX Runtime, or OpenVINO."""
+"""Networks of ONNX files, run by ONNX Runtime or by OpenVINO."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ import numpy as np
 from kpbench.errors import DataError
 from kpbench.types import Float32
 
+RUNTIMES = ("auto", "cpu", "cuda", "openvino")
+"""Values of the environment variable ``KPBENCH_RUNTIME``, see :func:`open_session`."""
 
-class Session(Protocol):
-    """What runs a network: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
+
+class InferenceSession(Protocol):
+    """A network that is ready to run: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """All outputs for an input by name."""
+        """Return all outputs of the network for inputs by name."""
         ...
 
 
 class OpenVinoSession:
-    """A network compiled by OpenVINO for the processor."""
+    """A network that OpenVINO has compiled for the processor."""
 
     def __init__(self, model: bytes, threads: int) -> None:
         import openvino
@@ -32,56 +35,67 @@ class OpenVinoSession:
         self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """All outputs for an input by name."""
+        """Return all outputs of the network for inputs by name."""
         results = self._compiled(feed)
         return [np.array(results[output]) for output in self._compiled.outputs]
 
 
-RUNTIMES = ("auto", "cpu", "cuda", "openvino")
-
-
-def on_gpu() -> bool:
-    """Whether networks run on CUDA here (see :func:`open_session`)."""
+def runs_on_gpu() -> bool:
+    """Return whether :func:`open_session` runs networks on CUDA."""
     import onnxruntime
 
-    return _asked() in ("auto", "cuda") and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    return _requested_runtime() in ("auto", "cuda") and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
 
 
-def _asked() -> str:
-    asked = os.environ.get("KPBENCH_RUNTIME", "auto")
-    if asked not in RUNTIMES:
-        raise DataError(f"KPBENCH_RUNTIME is {asked!r}, expected one of: {', '.join(RUNTIMES)}")
-    return asked
+def _requested_runtime() -> str:
+    runtime = os.environ.get("KPBENCH_RUNTIME", "auto")
+    if runtime not in RUNTIMES:
+        raise DataError(f"KPBENCH_RUNTIME is {runtime!r}, expected one of: {', '.join(RUNTIMES)}")
+    return runtime
 
 
-def open_session(model: bytes, threads: int = 0) -> tuple[Session, str]:
-    """A session for an ONNX model, and the text that kpbench wrote into the model, or "".
+def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]:
+    """Make a network ready to run.
 
-    The environment variable ``KPBENCH_RUNTIME`` chooses: "auto" (ONNX Runtime, on CUDA where the installed
-    package has it), "cpu", "cuda", or "openvino". 0 threads means as many as OpenCV may use: one in worker processes.
+    The environment variable ``KPBENCH_RUNTIME`` chooses the runtime: "auto" (ONNX Runtime, on CUDA where the installed
+    package supports it), "cpu", "cuda", or "openvino".
+
+    Parameters
+    ----------
+    model : bytes
+        Content of an ONNX file.
+    threads : int
+        0 means as many as OpenCV may use, which is one in worker processes.
+
+    Returns
+    -------
+    session : InferenceSession
+    metadata : str
+        Text that kpbench wrote into the file, or "".
 
     Raises
     ------
     DataError
-        If that runtime is not there.
+        If the runtime that was asked for is not installed.
     """
     import onnxruntime
 
-    asked = _asked()
+    runtime = _requested_runtime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cv2.getNumThreads()
     options.log_severity_level = 3
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")  # threads that wait take time from others
-    if asked == "cuda" and not on_gpu():
+    # threads that wait busily would take time from other processes
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    if runtime == "cuda" and not runs_on_gpu():
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if on_gpu():  # its default tries out all algorithms for every new size of input
+    if runs_on_gpu():  # the default setting would try out all algorithms for every new size of input
         providers.insert(0, ("CUDAExecutionProvider", {"cudnn_conv_algo_search": "HEURISTIC"}))
     session = onnxruntime.InferenceSession(model, options, providers=providers)
-    content = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
-    if asked != "openvino":
-        return session, content
+    metadata = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
+    if runtime != "openvino":
+        return session, metadata
     try:
-        return OpenVinoSession(model, threads or cv2.getNumThreads()), content
+        return OpenVinoSession(model, threads or cv2.getNumThreads()), metadata
     except ModuleNotFoundError:
         raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None

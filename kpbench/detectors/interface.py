@@ -1,7 +1,7 @@
-"""Detectors: what one is, how one is loaded, and the pieces that several share.
+"""What a detector is, the detectors that ship, and how a detector is loaded by name.
 
-A detector is anything that takes an image and returns :class:`~kpbench.types.Detections`: a function,
-or an object with a method ``detect``. There is nothing to inherit from.
+A detector takes an image and returns :class:`~kpbench.types.Detections`. It is a function, or an object with a method
+``detect``. There is nothing to inherit from.
 """
 
 from __future__ import annotations
@@ -33,17 +33,30 @@ DETECTORS = {
     "apriltag": "kpbench.detectors.tags:AprilTagDetector",
     "charuco": "kpbench.detectors.tags:CharucoDetector",
 }
-"""Name → where the shipped detector is, as ``MODULE:ATTR``."""
-
-PROGRAM = "program:"
-"""What the name of a detector begins with that is a program, see :func:`kpbench.detectors.run_program`."""
+"""Name of each shipped detector → where it is defined, as ``MODULE:ATTR``."""
+PROGRAM_PREFIX = "program:"
+"""A name that begins with this is a command line, see :func:`kpbench.detectors.program.run_program`."""
 
 
 class Detector(Protocol):
-    """What ``MODULE:ATTR`` may name (a plain function with this signature does as well)."""
+    """An object that ``MODULE:ATTR`` may name; a plain function with the signature of ``detect`` will do as well.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench import Detections
+    >>> class Brightest:
+    ...     def detect(self, image):
+    ...         y, x = np.unravel_index(image.argmax(), image.shape)
+    ...         return Detections([[x, y]], [1.0])
+    >>> image = np.zeros((4, 5), np.uint8)
+    >>> image[2, 3] = 255
+    >>> Brightest().detect(image).xy
+    array([[3., 2.]])
+    """
 
     def detect(self, image: UInt8) -> Detections:
-        """Detections in one image, (H, W) grey or (H, W, 3) RGB."""
+        """Return the detections in one image, uint8, (H, W) grey or (H, W, 3) RGB."""
         ...
 
 
@@ -54,16 +67,29 @@ class LoadedDetector:
     Attributes
     ----------
     name, version : str
-    run : function of an image.
-    board : the board of tags that it looks for (:data:`kpbench.patches.TAG_BOARDS`), None for patches.
-    identity : SHA-256 of name, version, settings and weights: what a detector's kept detections are valid for. None if
-        it tells no version.
-    run_many : function of several images, where that is faster than one by one, or None.
+    run : callable
+        Function of an image.
+    board : str, optional
+        Board of tags that the detector looks for (:data:`kpbench.patches.TAG_BOARDS`); None for patches.
+    identity : str, optional
+        SHA-256 of name, version, settings and weights. Kept detections stay valid as long as it is the same. None if
+        the detector tells no version.
+    run_many : callable, optional
+        Function of a sequence of images, for a detector that is faster on several images than on one.
 
     Raises
     ------
     DataError
         On a call, if the detector returns anything but finite :class:`Detections`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench import Detections
+    >>> from kpbench.detectors import LoadedDetector
+    >>> detector = LoadedDetector("nothing", "1", lambda image: Detections.none())
+    >>> len(detector(np.zeros((8, 8), np.uint8)))
+    0
     """
 
     name: str
@@ -74,18 +100,18 @@ class LoadedDetector:
     run_many: Callable[[Sequence[UInt8]], list[Detections]] | None = None
 
     def __call__(self, image: UInt8) -> Detections:
-        """Detections in one image, (H, W) grey or (H, W, 3) RGB, uint8."""
-        return self._checked(self.run(image))
+        """Return the detections in one image, uint8, (H, W) grey or (H, W, 3) RGB."""
+        return self._check(self.run(image))
 
     detect = __call__
 
     def detect_many(self, images: Sequence[UInt8]) -> list[Detections]:
-        """The same for each of several images; if it raises, nobody knows on which."""
+        """Return the detections per image; an error does not tell on which image it was raised."""
         if self.run_many is None:
             return [self(image) for image in images]
-        return [self._checked(found) for found in self.run_many(images)]
+        return [self._check(found) for found in self.run_many(images)]
 
-    def _checked(self, found: object) -> Detections:
+    def _check(self, found: object) -> Detections:
         if not isinstance(found, Detections):
             raise DataError(f"detector {self.name}: returned {type(found).__name__}, expected kpbench.Detections")
         if not (np.isfinite(found.xy).all() and np.isfinite(found.score).all()):
@@ -96,47 +122,63 @@ class LoadedDetector:
 
 
 def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
-    """A shipped detector by name; yours as weights ``FILE.onnx``, ``MODULE:ATTR``, or ``program:COMMAND``.
+    """Load a detector by name.
 
-    A file is one that ``kpbench export-model`` wrote. ``ATTR`` may be a function of an image, an object with a
-    method ``detect`` (or that can be called), or a class that gives such an object when called without
-    arguments. Modules in the current folder are found. ``threshold`` takes the place of the detector's own, if it
-    has an attribute of that name.
+    Parameters
+    ----------
+    name : str
+        One of :data:`DETECTORS`; weights ``FILE.onnx`` written by ``kpbench export-model``; ``MODULE:ATTR``; or
+        ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, an object that can be
+        called, or a class that makes such an object when it is called without arguments. Modules in the current folder
+        are found.
+    threshold : float, optional
+        Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own.
 
     Raises
     ------
     DataError
-        If there is no such detector, or it is none.
+        If there is no such detector, or the name stands for something that is no detector.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> detector = kpbench.load_detector("template")
+    >>> detector.name, detector.board
+    ('template', None)
+    >>> len(detector(np.full((48, 64), 128, np.uint8)))
+    0
     """
-    if name.startswith(PROGRAM):
-        many = partial(run_program, name.removeprefix(PROGRAM).strip())
-        return LoadedDetector(name, "unknown", lambda image: many([image])[0], run_many=many)
+    if name.startswith(PROGRAM_PREFIX):
+        run_many = partial(run_program, name.removeprefix(PROGRAM_PREFIX).strip())
+        return LoadedDetector(name, "unknown", lambda image: run_many([image])[0], run_many=run_many)
     if name.endswith(".onnx"):
-        made = _with(threshold, _resolve(DETECTORS["superpoint"])(Path(name)))
-        return LoadedDetector(Path(name).stem, made.version, made.detect, identity=_identity(name, made.version, made))
+        made = _set_threshold(_import_attribute(DETECTORS["superpoint"])(Path(name)), threshold)
+        digest = _digest_detector(name, made.version, made)
+        return LoadedDetector(Path(name).stem, made.version, made.detect, identity=digest)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
             "or program:COMMAND of your own"
         )
-    found = _resolve(DETECTORS.get(name, name))
+    found = _import_attribute(DETECTORS.get(name, name))
     try:
-        made = _with(threshold, found() if isinstance(found, type) else found)
+        made = _set_threshold(found() if isinstance(found, type) else found, threshold)
     except DataError:
         raise
     except (Exception, SystemExit) as error:
-        raise DataError(f"detector {name!r}: cannot be made, {type(error).__name__}: {one_line(error)}") from None
+        raise DataError(f"detector {name!r}: cannot be made, {type(error).__name__}: {in_one_line(error)}") from None
     run = getattr(made, "detect", made)
     if not callable(run):
         raise DataError(f"detector {name!r}: {made!r} cannot be called and has no method detect(image)")
     version = getattr(made, "version", __version__ if name in DETECTORS else None)
     label = name if name in DETECTORS else str(getattr(made, "name", name))
-    identity = None if version is None else _identity(name, str(version), made)
+    identity = None if version is None else _digest_detector(name, str(version), made)
     return LoadedDetector(label, str(version or "unknown"), run, getattr(made, "board", None), identity)
 
 
-def _identity(name: str, version: str, detector: Any) -> str:
-    """Digest of name, version, settings (plain public attributes) and weights (the file at ``path``)."""
+def _digest_detector(name: str, version: str, detector: Any) -> str:
+    """Return the SHA-256 of name, version, settings (plain public attributes) and weights (the file at ``path``)."""
     values = vars(detector) if hasattr(detector, "__dict__") else {}
     plain = {key: value for key, value in values.items() if key[0] != "_" and _is_plain(value)}
     digest = hashlib.sha256(repr([name, version, sorted(plain.items())]).encode())
@@ -147,20 +189,22 @@ def _identity(name: str, version: str, detector: Any) -> str:
 
 
 def _is_plain(value: object) -> bool:
-    """Whether a value is a setting: a number, a text, nothing, or a sequence of such."""
+    """Return whether a value is a setting: a number, a text, None, or a sequence of settings."""
     if isinstance(value, (tuple, list)):
         return all(map(_is_plain, value))
     return value is None or isinstance(value, (bool, int, float, str))
 
 
-def _with(threshold: float | None, detector: Any) -> Any:
+def _set_threshold(detector: Any, threshold: float | None) -> Any:
+    """Return the detector with another threshold, if it has one; the given object stays as it is."""
     if threshold is not None and hasattr(detector, "threshold"):
-        detector = copy(detector)  # which may be an object that others use as well
+        detector = copy(detector)
         detector.threshold = threshold
     return detector
 
 
-def _resolve(path: str) -> Any:
+def _import_attribute(path: str) -> Any:
+    """Return the object that ``MODULE:ATTR`` names."""
     module, _, attribute = path.partition(":")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
@@ -170,11 +214,11 @@ def _resolve(path: str) -> Any:
         raise DataError(f"detector {path!r}: there is no module {error.name!r}") from None
     except (Exception, SystemExit) as error:
         if not isinstance(error, AttributeError) or hasattr(sys.modules.get(module), attribute):
-            what = f"{type(error).__name__}: {one_line(error)}"
-            raise DataError(f"detector {path!r}: module {module!r} cannot be imported, {what}") from None
+            problem = f"{type(error).__name__}: {in_one_line(error)}"
+            raise DataError(f"detector {path!r}: module {module!r} cannot be imported, {problem}") from None
         raise DataError(f"detector {path!r}: module {module!r} has no attribute {attribute!r}") from None
 
 
-def one_line(error: BaseException) -> str:
-    """The text of an error without line breaks."""
+def in_one_line(error: BaseException) -> str:
+    """Return the text of an error without line breaks."""
     return " ".join(str(error).split())

@@ -1,4 +1,4 @@
-"""Run detectors over datasets and images, degrade images of one's own: stages chained, over workers."""
+"""Run detectors over datasets and over images that have no truth."""
 
 from __future__ import annotations
 
@@ -9,30 +9,38 @@ from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.folder import Dataset
-from kpbench.detectors.interface import LoadedDetector, load_detector, one_line
+from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detector
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import ImageSource, image_writer
-from kpbench.types import Detections, Predictions, UInt8
+from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
+
+IMAGES_PER_PIECE = 32
+"""Images that a worker process gets at a time."""
 
 
 @dataclass(frozen=True)
-class Predicted:
-    """What a detector found, and (image, message) of every image that could not be read or on which it raised.
+class PredictionRun:
+    """The result of running a detector over images.
 
-    Such an image counts as no detections.
+    Attributes
+    ----------
+    predictions : Predictions
+        A failed image has no detections.
+    failures : tuple of (str, str)
+        Name and message of each image that could not be read or on which the detector raised an error.
     """
 
     predictions: Predictions
     failures: tuple[tuple[str, str], ...]
 
 
-Found = tuple[Detections, str]
+ImageResult = tuple[Detections, str]
+"""Detections in an image, and the message of the error that the detector raised on it, or ""."""
 
 
 def predict(
@@ -43,39 +51,56 @@ def predict(
     workers: int | None = 1,
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
-) -> Predicted:
+) -> PredictionRun:
     """Run a detector over a dataset.
 
     Parameters
     ----------
     dataset : Dataset
-    detector : name or ``MODULE:ATTR`` (see :func:`kpbench.detectors.load_detector`), or a loaded one, which
-        stays in this process.
-    threshold : drop detections of a lower score, in place of the detector's own limit if it is given by name and has
-        one (an attribute ``threshold``); None keeps all.
-    workers : processes, for a detector given by name; None for one a core.
-    overlay : folder or video to draw the detections into.
-    progress : called as images are finished.
+    detector : str or LoadedDetector
+        A name as for :func:`kpbench.load_detector`, or a loaded detector.
+    threshold : float, optional
+        Detections of a lower score are dropped. A detector given by name gets it in place of its own threshold. None
+        keeps all detections.
+    workers : int, optional
+        Processes; None for one per core. A loaded detector stays in this process.
+    overlay : Path, optional
+        Folder or video file to draw the detections into.
+    progress : callable
+        Called with the number of images that are finished since the last call.
+
+    Returns
+    -------
+    PredictionRun
 
     Raises
     ------
     DataError
-        If the detector cannot be loaded, or the dataset cannot be read.
+        If the detector cannot be loaded, it fails on every image, or the dataset cannot be read.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> dataset = kpbench.generate(kpbench.SynthConfig(2, seed=1, size_px=(160, 120)), "data", workers=1).dataset
+    >>> run = kpbench.predict(dataset, "template")
+    >>> len(run.predictions), run.failures
+    (2, ())
     """
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):
         workers = 1
-    pieces = [range(first, min(first + 32, len(dataset))) for first in range(0, len(dataset), 32)]
-    work = partial(detect_some, dataset, loaded if workers == 1 else detector, threshold)
-    found: dict[int, Found] = {}
+    count, size = len(dataset), IMAGES_PER_PIECE
+    pieces = [range(first, min(first + size, count)) for first in range(0, count, size)]
+    work = partial(detect_images, dataset, loaded if workers == 1 else detector, threshold)
+    found: dict[int, ImageResult] = {}
     ids = dataset.truth.image_id
-    with image_writer(overlay, len(dataset)) as draw:
+    with image_writer(overlay, count) as draw:
         for results in run_jobs(work, pieces, workers, progress):
             found.update(results)
-        for n in range(len(dataset)) if overlay is not None else ():
+        for n in range(count) if overlay is not None else ():
             draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
     labels = [f"image_id {image_id}" for image_id in ids]
-    return _predicted(loaded, [found[n] for n in range(len(dataset))], labels, ids, dataset)
+    return _collect(loaded, [found[n] for n in range(count)], labels, ids, dataset)
 
 
 def predict_images(
@@ -85,83 +110,111 @@ def predict_images(
     threshold: float | None = None,
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
-) -> Predicted:
-    """Run a detector over images that have no truth; ``image_id`` is their place in the source.
+) -> PredictionRun:
+    """Run a detector over images that have no truth; ``image_id`` is the position of an image in the source.
 
-    Parameters and errors are those of :func:`predict`; ``source`` is from :func:`kpbench.images.open_images`.
+    Parameters
+    ----------
+    source : ImageSource
+        From :func:`kpbench.images.open_images`. A camera has no end: Ctrl-C ends it and keeps what was found.
+    detector, threshold, overlay, progress
+        As for :func:`predict`.
+
+    Returns
+    -------
+    PredictionRun
+
+    Raises
+    ------
+    DataError
+        If the detector cannot be loaded, or it fails on every image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.detectors import predict_images
+    >>> from kpbench.images import ImageSource
+    >>> images = iter([("a.png", np.full((48, 64), 128, np.uint8)), ("broken.png", None)])
+    >>> predict_images(ImageSource(images, 2), "template").failures
+    (('broken.png', 'cannot be decoded'),)
     """
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
-    found, labels = list[Found](), list[str]()
-    endless = () if source.length is not None else (KeyboardInterrupt,)
-    with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*endless):
-        # a camera never ends: Ctrl-C keeps what was found so far
+    found, labels = list[ImageResult](), list[str]()
+    ends_by = () if source.length is not None else (KeyboardInterrupt,)
+    with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
-            found.append(
-                (Detections.none(), "cannot be decoded") if image is None else _detect(loaded, image, threshold)
-            )
+            result = (Detections.none(), "cannot be decoded")
+            if image is not None:
+                result = _detect(loaded, image, threshold)
+            found.append(result)
             labels.append(label)
             if image is not None:
-                draw(label, draw_detections(image, found[-1][0]))
+                draw(label, draw_detections(image, result[0]))
             progress(1)
-    return _predicted(loaded, found, labels, np.arange(len(found)))
+    return _collect(loaded, found, labels, np.arange(len(found)))
 
 
-def _predicted(
-    detector: LoadedDetector,
-    found: list[Found],
-    labels: list[str],
-    ids: NDArray[np.int64],
-    dataset: Dataset | None = None,
-) -> Predicted:
-    if found and all(said for _, said in found):
+def _collect(
+    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, dataset: Dataset | None = None
+) -> PredictionRun:
+    if found and all(message for _, message in found):
         raise DataError(
             f"detector {detector.name}: failed on all {len(found)} images, first {labels[0]}: {found[0][1]}"
         )
     about = {"name": detector.name, "version": detector.version}
-    where = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
-    predictions = Predictions.from_detections([d for d, _ in found], ids, about, **where)
-    return Predicted(predictions, tuple((label, said) for label, (_, said) in zip(labels, found, strict=True) if said))
+    of_dataset = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
+    predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
+    failures = tuple((label, message) for label, (_, message) in zip(labels, found, strict=True) if message)
+    return PredictionRun(predictions, failures)
 
 
-def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> Found:
+def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> ImageResult:
     try:
         found = detector(image)
-    except (Exception, SystemExit) as error:  # whatever a detector of somebody else raises
-        return Detections.none(), f"{type(error).__name__}: {one_line(error)}{_line_of(error)}"
-    return _sure(found, threshold), ""
+    except (Exception, SystemExit) as error:  # a detector of the user may raise anything
+        return Detections.none(), f"{type(error).__name__}: {in_one_line(error)}{_user_line(error)}"
+    return _apply_threshold(found, threshold), ""
 
 
-def _sure(found: Detections, threshold: float | None) -> Detections:
+def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
     return found if threshold is None else found[found.score >= threshold]
 
 
-def _line_of(error: BaseException) -> str:
-    """Where in the detector's own file an error was raised."""
+def _user_line(error: BaseException) -> str:
+    """Return file and line of the user's code in which an error was raised, or ""."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
 
 
 @cache
-def _loaded(name: str, threshold: float | None) -> LoadedDetector:
+def _load_once(name: str, threshold: float | None) -> LoadedDetector:
     return load_detector(name, threshold)
 
 
-def detect_some(
-    dataset: Dataset, detector: str | LoadedDetector, threshold: float | None, piece: range, progress: Progress
-) -> dict[int, Found]:
-    """What a detector finds in some images of a dataset, and the message of each on which it raised, else "".
+def detect_images(
+    dataset: Dataset, detector: str | LoadedDetector, threshold: float | None, positions: range, progress: Progress
+) -> dict[int, ImageResult]:
+    """Run a detector over some images of a dataset; the other parameters are those of :func:`predict`.
 
-    Parameters are those of :func:`predict`; ``piece`` holds the positions of the images.
+    Parameters
+    ----------
+    positions : range
+        Positions of the images in the dataset.
+
+    Returns
+    -------
+    dict
+        Position → detections and error message, see :data:`ImageResult`.
     """
-    loaded = _loaded(detector, threshold) if isinstance(detector, str) else detector
+    loaded = _load_once(detector, threshold) if isinstance(detector, str) else detector
     if loaded.run_many is not None:
-        with contextlib.suppress(Exception):  # if it fails, one by one tells on which images
-            together = loaded.detect_many([dataset.image(n) for n in piece])
-            progress(len(piece))
-            return {n: (_sure(found, threshold), "") for n, found in zip(piece, together, strict=True)}
-    results: dict[int, Found] = {}
-    for n in piece:
+        with contextlib.suppress(Exception):  # on an error the images are tried one by one, below
+            batch = loaded.detect_many([dataset.image(n) for n in positions])
+            progress(len(positions))
+            return {n: (_apply_threshold(found, threshold), "") for n, found in zip(positions, batch, strict=True)}
+    results: dict[int, ImageResult] = {}
+    for n in positions:
         results[n] = _detect(loaded, dataset.image(n), threshold)
         progress(1)
     return results

@@ -16,25 +16,29 @@ from kpbench.types import Detections, UInt8
 
 
 def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
-    """Run ``COMMAND IMAGES OUT``: a folder with 00000000.png, 00000001.png, … and the JSON file to write.
+    """Run ``COMMAND FOLDER FILE`` over images.
+
+    FOLDER holds the images as 00000000.png, 00000001.png, …; the program writes FILE, a predictions file in JSON. In
+    that file ``image_id`` n means the n-th image, from 0.
 
     Parameters
     ----------
-    command : words as a shell reads them; no shell runs them.
-    images : sequence of ndarray, (H, W) grey or (H, W, 3) RGB, uint8
-        ``image_id`` n in the predictions file is the n-th.
+    command : str
+        Words as a shell reads them; no shell runs them.
+    images : sequence of ndarray
+        (H, W) grey or (H, W, 3) RGB, uint8.
 
     Returns
     -------
     list of Detections
-        One an image.
+        Per image.
 
     Raises
     ------
     DataError
-        If the program cannot be started, ends with another code than 0, or says nothing of an image.
+        If the program cannot be started, ends with an exit code other than 0, or says nothing of an image.
     PredictionsError
-        If what it wrote is no predictions file.
+        If the file that it wrote is no predictions file.
     """
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         folder, out = Path(scratch) / "images", Path(scratch) / "predictions.json"
@@ -47,8 +51,8 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
         except OSError as error:
             raise DataError(f"{command}: cannot be started, {error.strerror}") from None
         if done.returncode:
-            said = done.stderr.strip().splitlines() or ["nothing on stderr"]
-            raise DataError(f"{command}: exit code {done.returncode}, {said[-1]}")
+            lines = done.stderr.strip().splitlines() or ["nothing on stderr"]
+            raise DataError(f"{command}: exit code {done.returncode}, {lines[-1]}")
         if not out.exists():
             raise DataError(f"{command}: wrote no predictions file where its last argument says")
         found = read_predictions(out)

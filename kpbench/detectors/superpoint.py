@@ -1,8 +1,8 @@
-"""The reference detector: SuperPoint's raw heads from an ONNX file, decoded here in NumPy and OpenCV.
+"""The reference detector: SuperPoint's two heads from an ONNX file, decoded in NumPy and OpenCV.
 
-The graph gives logits a cell of 8x8 px. :func:`decode` turns them into keypoints: one probability map
-at full resolution, its local maxima, and for each maximum the centre of mass of the probability around
-it, whichever cells that lies in.
+The network gives logits for each cell of 8x8 px. :func:`decode` turns them into keypoints: the local maxima of one
+probability map at full resolution, each moved to the centre of mass of the probability around it, across the borders
+of cells.
 """
 
 from __future__ import annotations
@@ -17,32 +17,57 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.detectors import verification as verify
-from kpbench.detectors.inference import on_gpu, open_session
+from kpbench.detectors.inference import open_session, runs_on_gpu
 from kpbench.detectors.suppression import suppress
+from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
 from kpbench.errors import DataError
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
 from kpbench.types import Detections, Float, Float32, UInt8
 
-CELL = 8
+CELL_PX = 8
+"""Side of a cell, px."""
 SCHEMA = "kpbench.superpoint/1"
+"""Schema of the metadata in the ONNX file."""
+EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
+"""A cell is empty if the log odds of each of its pixels against "no keypoint" are lower. Nearly all cells are."""
+
+# Settings of the verified detector. The first three were chosen on synthetic images over training photographs, see
+# "Weaker places, longer ellipses, and judges on their poses" and "Fewer looks, and what ten thousand more images were
+# worth" in notebook/training-log.md; the source of the last two is not recorded.
+CANDIDATE_SCORE = 0.015
+"""Least score of a place, by the network, that is verified."""
+SCALES = (1.2, 0.5, 0.25)
+"""Scales of the image that the network sees: enlarged for small patches, shrunk for large ones."""
+VERIFIED_THRESHOLD = 0.3
+"""Least score of a verified detection."""
+MERGE_DISTANCE_PX = 3.0
+"""Of two candidates of different scales that are nearer to each other than this, the better one is kept."""
+DISC_SHARE = 0.6
+"""Of two centres that are nearer than this many short semi-axes, the likelier one is kept: discs do not overlap."""
 
 
 @dataclass(frozen=True)
 class Decoding:
-    """How logits become keypoints.
+    """Settings of :func:`decode`.
 
     Attributes
     ----------
     threshold : float
-        Least probability that a keypoint lies in the window around a maximum, in [0, 1]; what lies under 0.01 may go.
+        Least probability that a keypoint lies in the window around a maximum, in [0, 1]. Under 0.01 some keypoints
+        may be missed.
     separation_px : int
-        Of two maxima closer than this the weaker one is dropped. Discs that do not overlap and whose
-        short axes measure 10 px have their centres at least so far apart.
+        Of two maxima that are nearer than this, px, the better one is kept. Discs whose short axis measures 10 px and
+        that do not overlap have centres further apart.
     window_px : int
-        Reach of the window that is summed up, and averaged for the sub-pixel position: it is
-        ``2 · window_px + 1`` wide.
+        Reach of the window around a maximum, px: it is ``2 · window_px + 1`` px wide. Its sum is the score, its
+        centre of mass the place.
+
+    Examples
+    --------
+    >>> from kpbench.detectors import Decoding
+    >>> Decoding(threshold=0.3).window_px
+    3
     """
 
     threshold: float = 0.5
@@ -51,51 +76,62 @@ class Decoding:
 
 
 def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | None = None) -> Detections:
-    """Keypoints from the two heads of one image, as the network alone sees them.
+    """Return the keypoints that the two heads of the network see in one image.
 
     Parameters
     ----------
     detector_logits : ndarray of shape (65, h, w), float32
-        A pixel of the cell each, in row order, then "no keypoint".
+        One channel per pixel of a cell, row by row, then "no keypoint".
     id_logits : ndarray of shape (ids + 1, h, w), float32
-        A patch each, then "no patch".
+        One channel per design, then "no patch".
     decoding : Decoding, optional
+        None: the defaults.
 
     Returns
     -------
     Detections
-        In the frame of the (8h, 8w) image, best first; ``patch_id`` is the place of the patch in the ID head.
+        ``xy`` in px of the (8h, 8w) image, best first. ``patch_id`` is the channel of the ID head.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.detectors import decode
+    >>> detector_logits, id_logits = np.zeros((65, 4, 4), np.float32), np.zeros((5, 4, 4), np.float32)
+    >>> detector_logits[64] = 10                      # "no keypoint" in all cells ...
+    >>> detector_logits[8 * 5 + 3, 2, 1] = 30         # ... but at row 5, column 3 of the cell in row 2, column 1
+    >>> decode(detector_logits, id_logits).xy
+    array([[11., 21.]])
     """
     xy, score = locate(detector_logits, decoding or Decoding())
     return Detections(xy, score, np.argmax(identify(id_logits, xy)[:, :-1], axis=1))
 
 
-def locate(detector_logits: Float32, how: Decoding) -> tuple[Float, Float]:
-    """Places (n, 2) px and scores (n,) of keypoints from the (65, h, w) detector logits, best first."""
+def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
+    """Return places (n, 2) px and scores (n,) of keypoints from detector logits (65, h, w), best first."""
     probability = keypoint_probability(detector_logits)
     # a light smoothing ranks neighbours within a blob, so that one blob has one maximum
     ranked = cv2.GaussianBlur(probability, (5, 5), 1.0, borderType=cv2.BORDER_CONSTANT)
-    side = 2 * how.separation_px - 1
+    side = 2 * decoding.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
-    width, offset = 2 * how.window_px + 1, np.arange(-how.window_px, how.window_px + 1)
-    # what holds the threshold in its window has at least the mean of it at its maximum
-    found = np.flatnonzero(ranked > 0.5 * how.threshold / width**2)  # of two axes it takes many times as long
+    width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
+    # a window whose sum reaches the threshold has at least its mean at its maximum, but for the smoothing
+    found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])
     windows = _windows(probability, rows[:, None] + offset, columns[:, None] + offset)
     total = windows.sum(axis=(1, 2))
-    likely = total >= how.threshold
+    likely = total >= decoding.threshold
     rows, columns, windows, total = rows[likely], columns[likely], windows[likely], total[likely]
     x = columns + windows.sum(axis=1) @ offset / total
     y = rows + windows.sum(axis=2) @ offset / total
     xy = np.column_stack([x, y])
     score = np.minimum(total, 1.0).astype(np.float64)
-    kept = suppress(xy, score, how.separation_px)
+    kept = suppress(xy, score, decoding.separation_px)
     return xy[kept], score[kept]
 
 
 def _windows(image: Float32, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float32:
-    """Parts (n, k, k) of an image at rows (n, k) and columns (n, k); 0 outside."""
+    """Return windows (n, k, k) of an image at rows (n, k) and columns (n, k); 0 outside the image."""
     height, width = image.shape
     inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None]
     part = image[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None]]
@@ -103,32 +139,28 @@ def _windows(image: Float32, rows: NDArray[np.int64], columns: NDArray[np.int64]
 
 
 def identify(id_logits: Float32, xy: Float) -> Float:
-    """Log-probabilities (n, ids + 1) of each patch and of "no patch" at places (n, 2) px."""
-    logits = _at(id_logits, xy)
+    """Return log probabilities (n, ids + 1) of each design and of "no patch" at places (n, 2) px."""
+    logits = _interpolate_cells(id_logits, xy)
     logits = logits - logits.max(axis=1, keepdims=True)
     return np.asarray(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
 
 
-FAINT = float(np.log(2e-4))
-"""Log of how much less likely than "no keypoint" every pixel of an empty cell is: nearly all cells are."""
-
-
 def keypoint_probability(detector_logits: Float32) -> Float32:
-    """Softmax over each cell, laid out as an image: (65, h, w) to (8h, 8w); 0 in empty cells."""
+    """Return the softmax of detector logits (65, h, w) over each cell as an image (8h, 8w); 0 in empty cells."""
     _, h, w = detector_logits.shape
-    rows, columns = np.nonzero(detector_logits[:-1].max(axis=0) - detector_logits[-1] > FAINT)
+    rows, columns = np.nonzero(detector_logits[:-1].max(axis=0) - detector_logits[-1] > EMPTY_CELL_LOG_ODDS)
     logits = detector_logits[:, rows, columns]
     share = np.exp(logits - logits.max(axis=0))
     share = share[:-1] / share.sum(axis=0)
-    probability = np.zeros((h, CELL, w, CELL), np.float32)
-    probability[rows, :, columns] = share.T.reshape(-1, CELL, CELL)
-    return probability.reshape(CELL * h, CELL * w)
+    probability = np.zeros((h, CELL_PX, w, CELL_PX), np.float32)
+    probability[rows, :, columns] = share.T.reshape(-1, CELL_PX, CELL_PX)
+    return probability.reshape(CELL_PX * h, CELL_PX * w)
 
 
-def _at(cells: Float32, xy: Float) -> Float:
-    """Bilinear values of a cell map at pixels: (C, h, w) and (n, 2) to (n, C); cell centres at 3.5 + 8i px."""
+def _interpolate_cells(cells: Float32, xy: Float) -> Float:
+    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; centres of cells are 3.5 + 8i."""
     _, h, w = cells.shape
-    u = np.clip((xy - (CELL - 1) / 2) / CELL, 0, (w - 1, h - 1))
+    u = np.clip((xy - (CELL_PX - 1) / 2) / CELL_PX, 0, (w - 1, h - 1))
     low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
     (fx, fy), (j, i) = (u - low).T, low.T
     j1, i1 = np.minimum(j + 1, w - 1), np.minimum(i + 1, h - 1)
@@ -138,50 +170,52 @@ def _at(cells: Float32, xy: Float) -> Float:
 
 
 def _inside(xy: Float, image: UInt8) -> NDArray[np.bool_]:
-    """Whether places (n, 2) px lie in the image."""
+    """Return whether places (n, 2) px lie in the image."""
     return np.asarray(np.all((xy > -0.5) & (xy < np.subtract(image.shape[1::-1], 0.5)), axis=1))
 
 
 def pad_to_cells(grey: UInt8) -> UInt8:
-    """Repeat the last row and column until both sides are multiples of 8; (0, 0) stays where it is."""
+    """Return an image whose last row and column are repeated until both sides are multiples of 8 px."""
     height, width = grey.shape
-    return np.pad(grey, ((0, -height % CELL), (0, -width % CELL)), mode="edge")
-
-
-CANDIDATE = 0.015
-"""Least score of the network from which a place is worth verifying."""
-SCALES = (1.2, 0.5, 0.25)
-"""Scales of the image at which candidates are looked for: small patches are found better enlarged, large shrunk."""
-LIKELY = 0.3
-"""Least probability of a verified detection: on training photographs few false alarms have as much at 1624x1240."""
-SAME_PX = 3.0
-"""Candidates of two scales that are nearer to each other than this are one."""
+    return np.pad(grey, ((0, -height % CELL_PX), (0, -width % CELL_PX)), mode="edge")
 
 
 @dataclass
 class SuperPointDetector:
-    """SuperPoint on ONNX Runtime; call it with an image.
+    """SuperPoint, its candidates verified by the designs; call it with an image.
 
     Attributes
     ----------
     path : Path, optional
-        ONNX file written by ``kpbench export-model``; None: the weights that ship with kpbench, in 8-bit
-        integers for a processor, float32 for a GPU.
+        ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, in 8-bit integers on a
+        processor, in float32 on a GPU.
     threshold : float, optional
-        Least score of a detection, in [0, 1]; None: 0.5 of the network alone, 0.3 where it is verified.
+        Least score of a detection, in [0, 1]. None: 0.3 where candidates are verified, else 0.5.
     verified : bool
-        Whether the network's candidates are compared with the designs, which the file holds
-        (:mod:`kpbench.detectors`): that gives centre, identity and score. False: the network alone decides, at
-        the image's own scale; so it is also for designs without an edge at the centre, whose pose shows nowhere.
+        Whether candidates of the network are compared with the designs, which the file holds. The verification then
+        gives centre, identity and score. False: the network alone decides, at the image's own scale. Designs without
+        an edge at the centre cannot be verified; then it becomes False.
     threads : int
-        Threads of the network's runtime; 0 means as many as OpenCV may use.
+        Threads of the networks; 0 means as many as OpenCV may use.
     scales : tuple of float
-        Scales of the image at which candidates are looked for, where they are verified.
+        Scales of the image that the network sees where candidates are verified.
+    shipped : str
+        Name of the shipped weights that ``path=None`` means.
 
     Raises
     ------
     DataError
-        If the file cannot be read or was not written by kpbench, or the scales are none.
+        If the file cannot be read or was not written by kpbench, or a scale is not in (0, 16].
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.detectors import SmallSuperPointDetector
+    >>> detector = SmallSuperPointDetector(threshold=0.5)
+    >>> detector.name
+    'superpoint-small'
+    >>> len(detector(np.full((48, 64), 128, np.uint8)))
+    0
     """
 
     path: Path | None = None
@@ -194,7 +228,7 @@ class SuperPointDetector:
     def __post_init__(self) -> None:
         if not self.scales or not all(0 < scale <= 16 for scale in self.scales):
             raise DataError(f"scales are {self.scales}, expected at least one, each over 0 and up to 16")
-        ours = Path(__file__).parent / "weights" / f"{self.shipped}{'' if on_gpu() else '-int8'}.onnx"
+        ours = WEIGHTS / f"{self.shipped}{'' if runs_on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
             self._session, text = open_session(self.path.read_bytes(), self.threads)
@@ -211,76 +245,79 @@ class SuperPointDetector:
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
         self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
         if self.verified:
-            self.version += f"-{verify.version(CANDIDATE, self.scales)}"
+            self.version += f"-{verifier_version(CANDIDATE_SCORE, self.scales)}"
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     @property
-    def _least(self) -> float:
-        return self.threshold if self.threshold is not None else LIKELY if self.verified else Decoding.threshold
+    def _threshold(self) -> float:
+        default = VERIFIED_THRESHOLD if self.verified else Decoding.threshold
+        return default if self.threshold is None else self.threshold
 
     def __call__(self, image: UInt8) -> Detections:
-        """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
+        """Return the detections in one image, uint8 (H, W) or RGB (H, W, 3), best first."""
         return self.batch([image])[0]
 
     detect = __call__
 
     def batch(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Detections of several images of one size, which pass the network in one call.
+        """Return the detections in each of several images of one size; the network sees all images in one call.
 
         Raises
         ------
         DataError
-            If one is no image, or they differ in size.
+            If an array is no image, or the images differ in size.
         """
         greys = [to_grey(image) for image in images]
         if len({grey.shape for grey in greys}) > 1:
             raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         if not greys or not greys[0].size:
             return [Detections.none() for _ in greys]
-        return [self._decoded(grey, *seen) for grey, seen in zip(greys, self.candidates(greys), strict=True)]
+        return [self._decide(grey, *seen) for grey, seen in zip(greys, self.candidates(greys), strict=True)]
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
-        """The two raw heads of several grey images of one size: (B, 65, h, w) and (B, ids + 1, h, w)."""
+        """Return the logits of the two heads, (B, 65, h, w) and (B, ids + 1, h, w), for B grey images of one size."""
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         return self._session.run(None, {"image": blob})
 
     def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
-        """Where the network sees something, for each of several grey images of one size.
+        """Return the places where the network sees something, for each of several grey images of one size.
 
         Returns
         -------
-        Places (n, 2) px, their scores (n,), and log-probabilities (n, ids + 1) of each design and of none; best first.
+        list of tuple
+            Per image: places (n, 2) px, best first; their scores (n,); and log probabilities (n, ids + 1) of each
+            design and of no patch.
         """
-        how = Decoding(CANDIDATE if self.verified else self._least)
+        decoding = Decoding(CANDIDATE_SCORE if self.verified else self._threshold)
         height, width = greys[0].shape
         found: list[list[tuple[Float, Float, Float]]] = [[] for _ in greys]
         for scale in self.scales if self.verified else (1.0,):
             size = max(1, round(scale * width)), max(1, round(scale * height))
-            exact = np.divide(size, (width, height))  # what rounding to whole pixels makes of the scale
+            exact_scale = np.divide(size, (width, height))  # differs from ``scale`` by the rounding to whole px
             heads = self.heads([resize(grey, *size) for grey in greys])
             for parts, detector, ids in zip(found, *heads, strict=True):
-                there, score = locate(detector, how)
-                xy = (there + 0.5) / exact - 0.5
+                scaled_xy, score = locate(detector, decoding)
+                xy = (scaled_xy + 0.5) / exact_scale - 0.5
                 inside = _inside(xy, greys[0])
-                parts.append((xy[inside], score[inside], identify(ids, there[inside])))
+                parts.append((xy[inside], score[inside], identify(ids, scaled_xy[inside])))
         columns = [[np.concatenate(column) for column in zip(*parts, strict=True)] for parts in found]
-        once = [suppress(xy, score, SAME_PX) for xy, score, _ in columns]
-        return [(xy[k], score[k], log_id[k]) for (xy, score, log_id), k in zip(columns, once, strict=True)]
+        kept = [suppress(xy, score, MERGE_DISTANCE_PX) for xy, score, _ in columns]
+        return [(xy[k], score[k], log_id[k]) for (xy, score, log_id), k in zip(columns, kept, strict=True)]
 
-    def _decoded(self, grey: UInt8, xy: Float, score: Float, log_id: Float) -> Detections:
+    def _decide(self, grey: UInt8, xy: Float, score: Float, log_id: Float) -> Detections:
+        """Return the detections among the candidates of one image."""
         if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
-        found = verify.examine(grey, xy, score, log_id, self.patches, self.threads)
-        sure = np.flatnonzero((found.score >= self._least) & _inside(found.xy, grey))
-        xy, score, apart = found.xy[sure], found.score[sure], 0.6 * found.minor_px[sure]
-        # discs do not overlap: of two centres within one disc the likelier stays
-        kept = suppress(xy, score, np.maximum(Decoding.separation_px, apart))
-        return Detections(xy[kept], score[kept], self._patch_ids[found.which[sure[kept]]])
+        found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads)
+        likely = np.flatnonzero((found.score >= self._threshold) & _inside(found.xy, grey))
+        xy, score, reach = found.xy[likely], found.score[likely], DISC_SHARE * found.minor_px[likely]
+        kept = suppress(xy, score, np.maximum(Decoding.separation_px, reach))
+        return Detections(xy[kept], score[kept], self._patch_ids[found.design[likely[kept]]])
 
 
 @dataclass
 class SmallSuperPointDetector(SuperPointDetector):
-    """The same with the smaller network."""
+    """:class:`SuperPointDetector` with the smaller network."""
 
     shipped: ClassVar[str] = "superpoint-small"
 

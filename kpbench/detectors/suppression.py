@@ -1,38 +1,49 @@
-"""Of places that are near each other the best one stays."""
+"""Non-maximum suppression: of points near each other, the best one is kept."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from kpbench.types import Float
+from kpbench.types import Float, Int
 
 
-def suppress(xy: Float, score: Float, distance_px: float | Float) -> NDArray[np.int64]:
-    """Non-maximum suppression: indices of the points that have no better kept one within a distance.
+def suppress(xy: Float, score: Float, distance_px: float | Float) -> Int:
+    """Return the indices of points that have no better kept point near them.
+
+    Points are visited from the best on. A point is kept unless a better point that is kept lies nearer than that
+    point's distance.
 
     Parameters
     ----------
-    xy : ndarray of shape (n, 2), px
+    xy : ndarray of shape (n, 2)
+        Points, px.
     score : ndarray of shape (n,)
+        Higher is better.
     distance_px : float or ndarray of shape (n,)
-        Reach of a point, over worse ones.
+        Distance within which a point suppresses worse points, px.
 
     Returns
     -------
     ndarray of shape (k,), int64
-        Best first; equal scores in order of x, then y.
+        Best first; equal scores in the order of x, then y.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.detectors import suppress
+    >>> suppress(np.array([[0.0, 0.0], [3.0, 0.0], [9.0, 0.0]]), np.array([0.5, 0.9, 0.7]), 5.0)
+    array([1, 2])
     """
     order = np.lexsort((xy[:, 1], xy[:, 0], -score))
     reach = np.broadcast_to(np.asarray(distance_px, np.float64), score.shape)[order]
     kept = np.ones(len(order), bool)
     if len(order):
         pairs = cKDTree(xy[order]).query_pairs(reach.max(), output_type="ndarray")
-        better, worse = pairs.min(axis=1), pairs.max(axis=1)  # order is from the best on
+        better, worse = pairs.min(axis=1), pairs.max(axis=1)  # a lower rank is better
         near = np.hypot(*(xy[order[better]] - xy[order[worse]]).T) < reach[better]
         by_rank = np.flatnonzero(near)[np.argsort(better[near], kind="stable")]
         for one, other in zip(better[by_rank].tolist(), worse[by_rank].tolist(), strict=True):
-            if kept[one]:  # all that is better than this one has been seen
+            if kept[one]:  # all points better than this one have been visited
                 kept[other] = False
     return order[kept]

@@ -1,11 +1,12 @@
 """A classical detector: no training, any design with straight edges that cross at its centre.
 
-Edges that meet at a point point at it, under any perspective. So the first stage (:func:`crossings`)
-asks of every pixel whether the gradients around it are square to the direction to it, and are of more than
-one direction (a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
-location of distinct points*, 1987). That needs no templates. The few hundred places that remain are
-compared with the designs (:mod:`kpbench.fitting`, :mod:`kpbench.fitting`), coarse to fine, each stage on
-what the one before kept, and what is left is fitted (:mod:`kpbench.fitting`).
+Straight edges that meet at a point point towards it under any perspective. So the first stage, :func:`find_crossings`,
+asks of every pixel whether the gradients around it are perpendicular to the direction to it and do not all have one
+direction. This is a form of the operator of Förstner and Gülch, *A fast operator for detection and precise location of
+distinct points, corners and centres of circular features*, 1987; it needs no templates. A few hundred places remain.
+They are compared with the designs, coarse to fine (:mod:`kpbench.fitting.sector_search`,
+:mod:`kpbench.fitting.align`), each stage on the poses that the stage before kept. The design is fitted to those that
+are left (:mod:`kpbench.fitting.design_fit`).
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
-from kpbench.fitting import design_fit as refine
-from kpbench.fitting import sector_search as sectors
-from kpbench.fitting.align import WHOLE_PX, Poses, align, short_axis
-from kpbench.fitting.pyramid import Picture
-from kpbench.fitting.templates import bank
+from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, short_semi_axis
+from kpbench.fitting.design_fit import Fit, fit
+from kpbench.fitting.pyramid import Pyramids
+from kpbench.fitting.sector_search import CORE_RADIUS_PX, core_symmetries, estimate_size, search_sectors
+from kpbench.fitting.templates import build_templates
 from kpbench.images import to_grey
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, Float32, Int, UInt8
@@ -28,111 +29,210 @@ from kpbench.workers import one_blas_thread
 
 VERSION = "1"
 """Version of the method. Raise it by one when detections change."""
-WINDOW_PX = 1.1
-"""Standard deviation of the window, in px of a level: it sees 1 to 3 px around a place."""
-RADIAL = 0.7
-"""How much a gradient along the direction to the place counts against one across it."""
-EVERY_PX, AT_LEAST = 770, 100
-"""Places kept: one for so many pixels of the level, and some for small ones."""
 
 
-def crossings(level: Float32) -> tuple[Float, Float]:
-    """Places where edges of several directions meet.
+@dataclass(frozen=True)
+class Thresholds:
+    """All limits of the detector. Their sources are not recorded, but for the weights of the score.
+
+    Attributes
+    ----------
+    window_px : float
+        Standard deviation of the window of :func:`find_crossings`, px of a level: it reaches 1 to 3 px.
+    radial : float
+        Weight of a gradient along the direction to the place, against one perpendicular to it.
+    octaves : int
+        Levels of the pyramid in which crossings are searched.
+    px_per_place, places : int
+        Crossings that are kept in a level: one for so many px of it, and so many more.
+    margin : float
+        Designs whose correlation is lower than the best one's at a place by more than this are left out.
+    search_ncc : float
+        Least correlation near the centre after the search.
+    align_steps, align_ncc : tuple
+        The core is aligned in three rounds: Gauss-Newton steps of each, and least correlation after each.
+    align_radius : float
+        The core is aligned where its short semi-axis measures this many times ``CORE_RADIUS_PX``.
+    near : float
+        Two poses are near if their centres are nearer than this, in radii of the core's circle.
+    much_better_ncc : float
+        Of two near poses of different designs, one is dropped if its correlation is lower by more than this.
+    most_candidates : int
+        Candidates per 640x480 px that are aligned as whole designs; the most of a smaller image, too.
+    whole_steps : int
+        Gauss-Newton steps of that alignment.
+    likeness : float
+        Least :meth:`ScoreWeights.likeness` of a candidate that is fitted.
+    disc_share : float
+        A detection is dropped if it lies within this part of a better one's disc.
+    """
+
+    window_px: float = 1.1
+    radial: float = 0.7
+    octaves: int = 4
+    px_per_place: int = 770
+    places: int = 100
+    margin: float = 0.2
+    search_ncc: float = 0.62
+    align_steps: tuple[int, int, int] = (1, 1, 3)
+    align_ncc: tuple[float, float, float] = (0.72, 0.8, 0.89)
+    align_radius: float = 0.9
+    near: float = 0.7
+    much_better_ncc: float = 0.05
+    most_candidates: int = 80
+    whole_steps: int = 4
+    likeness: float = 11.7
+    disc_share: float = 0.9
+
+
+@dataclass(frozen=True)
+class ScoreWeights:
+    """Weights of the score: a logistic regression on five measures of a candidate.
+
+    Source: fitted to candidates in synthetic images over training photographs, under every deterioration of the paper.
+    A candidate was right if it lay within a tenth of the radius and had the right design, wrong if it lay on no patch;
+    others were left out.
+
+    Attributes
+    ----------
+    offset : float
+    core, whole : float
+        Of log(1.01 − correlation), near the centre and over the disc.
+    unexplained : float
+        Of the log of the residuals of the fit beyond the image's noise, in contrasts.
+    blur : float
+        Of the blur, in short semi-axes.
+    contrast : float
+        Of the log of the contrast, over the range of the image.
+    """
+
+    offset: float = -12.55
+    core: float = -2.13
+    whole: float = -2.59
+    unexplained: float = -0.78
+    blur: float = -16.64
+    contrast: float = 2.46
+
+    def likeness(self, core_ncc: Float, whole_ncc: Float) -> Float:
+        """Return the part (n,) of the log odds that the two correlations (n,) contribute."""
+        return np.asarray(self.core * np.log(1.01 - core_ncc) + self.whole * np.log(1.01 - whole_ncc))
+
+
+THRESHOLDS, WEIGHTS = Thresholds(), ScoreWeights()
+
+
+def find_crossings(level: Float32) -> tuple[Float, Float]:
+    """Find places where edges of several directions meet.
 
     Parameters
     ----------
-    level : ndarray of shape (H, W), float32, grey levels.
+    level : ndarray of shape (H, W), float32
+        Grey levels.
 
     Returns
     -------
-    xy : ndarray of shape (n, 2), whole px; the best places, at most one for every 770 px, and 100.
-    strength : ndarray of shape (n,), in falling order.
+    xy : ndarray of shape (n, 2)
+        Whole px; the strongest places, at most ``THRESHOLDS.places`` and one per ``THRESHOLDS.px_per_place`` px.
+    strength : ndarray of shape (n,)
+        In falling order.
     """
     gx = cv2.Scharr(level, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(level, cv2.CV_32F, 0, 1, scale=1 / 32)
     q = np.arange(-4.0, 5.0)
-    weight = np.exp(-(q**2) / (2 * WINDOW_PX**2))
+    weight = np.exp(-(q**2) / (2 * THRESHOLDS.window_px**2))
     moments = [weight / weight.sum() * q**n for n in range(3)]
 
-    def around(image: Float32, nx: int, ny: int) -> Float32:
-        """Sum over q of w(q) qx^nx qy^ny image(p + q)."""
+    def moment(image: Float32, nx: int, ny: int) -> Float32:
+        """Return at each p the sum over q of w(q) qx^nx qy^ny image(p + q)."""
         return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, moments[nx], moments[ny]))
 
     xx, xy, yy = gx * gx, gx * gy, gy * gy
-    xx_x, yy_y, xy_xy = around(xx, 2, 0), around(yy, 0, 2), around(xy, 1, 1)
+    xx_x, yy_y, xy_xy = moment(xx, 2, 0), moment(yy, 0, 2), moment(xy, 1, 1)
     radial = xx_x + 2 * xy_xy + yy_y  # sum of w (g·q)²
-    a, c = xx_x + around(xx, 0, 2), yy_y + around(yy, 2, 0)
-    b = around(xy, 2, 0) + around(xy, 0, 2)
-    # the square root of the determinant of the sum of w |q|² g gᵀ: under tilt it falls as the area does, whereas
-    # the smaller eigenvalue of Harris-like measures falls faster
+    a, c = xx_x + moment(xx, 0, 2), yy_y + moment(yy, 2, 0)
+    b = moment(xy, 2, 0) + moment(xy, 0, 2)
+    # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt it falls as the area does; the smaller
+    # eigenvalue, which measures like Harris' use, falls faster
     spread = np.sqrt(np.maximum(a * c - b * b, 0))
-    strength = (spread - RADIAL * radial) / np.sqrt(a + c + 50.0)
+    strength = (spread - THRESHOLDS.radial * radial) / np.sqrt(a + c + 50.0)
     strength[[0, -1]], strength[:, [0, -1]] = 0, 0
     peak = (strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > 0)
     rows, columns = np.nonzero(peak)
     found = strength[rows, columns]
-    best = np.argsort(-found, kind="stable")[: level.size // EVERY_PX + AT_LEAST]
+    best = np.argsort(-found, kind="stable")[: level.size // THRESHOLDS.px_per_place + THRESHOLDS.places]
     return np.column_stack([columns, rows])[best].astype(np.float64), found[best].astype(np.float64)
-
-
-CORE, LIKENESS, MOST = 0.89, 11.7, 80
-"""Least correlation of a candidate near its centre, least likeness, most candidates of 640x480 px."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """What was fitted in one image, with overlaps and whatever its score.
+    """The n fits of one image, before overlaps and low scores are removed.
 
     Attributes
     ----------
-    which : (n,) index of the design.
-    core, whole : (n,) correlations near the centre and over the disc, before the fit.
-    fit : the fits.
-    noise : standard deviation of the image's noise, grey levels.
-    range : from the darkest to the brightest of the image, grey levels.
+    design : ndarray of shape (n,), int64
+        Index of the design.
+    core_ncc, whole_ncc : ndarray of shape (n,)
+        Correlations near the centre and over the disc, before the fit.
+    fit : Fit
+    noise : float
+        Standard deviation of the image's noise, grey levels.
+    grey_range : float
+        Difference between the bright and the dark parts of the image, grey levels.
     """
 
-    which: Int
-    core: Float
-    whole: Float
-    fit: refine.Fit
+    design: Int
+    core_ncc: Float
+    whole_ncc: Float
+    fit: Fit
     noise: float
-    range: float
+    grey_range: float
 
     @property
     def score(self) -> Float:
-        """Probability (n,) that a candidate is a patch.
-
-        A logistic regression on candidates of synthetic images (every deterioration of the paper, training
-        photographs only) that were within a tenth of the radius and of the right design, or on no patch.
-        """
+        """Probability (n,) that each candidate is a patch, by :class:`ScoreWeights`."""
         contrast = np.maximum(self.fit.white - self.fit.black, 1.0)
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
-        relative_blur = np.minimum(self.fit.blur_px / np.maximum(short_axis(self.fit.A), 0.5), 1)
-        evidence = (
-            -12.55
-            + sectors.likeness(self.core, self.whole)
-            - 0.78 * np.log(np.minimum(unexplained, 3) + 0.02)
-            - 16.64 * relative_blur
-            + 2.46 * np.log(contrast / (self.range + 5))
+        relative_blur = np.minimum(self.fit.blur_px / np.maximum(short_semi_axis(self.fit.A), 0.5), 1)
+        log_odds = (
+            WEIGHTS.offset
+            + WEIGHTS.likeness(self.core_ncc, self.whole_ncc)
+            + WEIGHTS.unexplained * np.log(np.minimum(unexplained, 3) + 0.02)
+            + WEIGHTS.blur * relative_blur
+            + WEIGHTS.contrast * np.log(contrast / (self.grey_range + 5))
         )
-        sane = (self.fit.white > self.fit.black) & np.isfinite(evidence)
-        return np.where(sane, 1 / (1 + np.exp(-np.clip(evidence, -30, 30))), 0.0)
+        possible = (self.fit.white > self.fit.black) & np.isfinite(log_odds)
+        return np.where(possible, 1 / (1 + np.exp(-np.clip(log_odds, -30, 30))), 0.0)
 
 
 @dataclass
 class TemplateDetector:
-    """Finds patches by comparing the image with their designs; call it with an image.
+    """Find patches by comparing the image with their designs; call the detector with an image.
 
     Attributes
     ----------
-    patches : the designs to look for.
-    threshold : least score of a detection, in [0, 1].
+    patches : tuple of Patch
+        The designs to look for.
+    threshold : float
+        Least score of a detection, in [0, 1].
+    name, version : str
 
     Raises
     ------
     DataError
-        If a design has no edges of two directions at its centre: a whole edge looks like that.
+        If a design has no edges of two directions that meet at its centre.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.detectors import TemplateDetector
+    >>> patch = kpbench.shipped_patches()[1]
+    >>> v, u = (np.mgrid[:64, :64] - 31.5) / 20.0
+    >>> black = patch.is_black(np.stack([u, v], axis=-1))
+    >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.uint8)
+    >>> found = TemplateDetector((patch,))(image)
+    >>> found.xy.round(1), found.patch_id
+    (array([[31.5, 31.5]]), array([1]))
     """
 
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
@@ -148,7 +248,7 @@ class TemplateDetector:
                 )
 
     def __call__(self, image: UInt8) -> Detections:
-        """Detections of one image, uint8 (H, W) or RGB (H, W, 3), best first."""
+        """Return the detections in one image, uint8 (H, W) or RGB (H, W, 3), best first."""
         grey = to_grey(image)
         if not grey.size:
             return Detections.none()
@@ -157,59 +257,59 @@ class TemplateDetector:
         score = found.score
         order = np.argsort(-score, kind="stable")
         order = order[score[order] >= self.threshold]
-        kept = order[_uncovered(found.fit.xy[order], found.fit.A[order], 0.9)]
+        kept = order[_select_uncovered(found.fit.xy[order], found.fit.A[order])]
         ids = np.array([patch.patch_id for patch in self.patches], np.int64)
-        return Detections(found.fit.xy[kept], score[kept], ids[found.which[kept]])
+        return Detections(found.fit.xy[kept], score[kept], ids[found.design[kept]])
 
     detect = __call__
 
     def candidates(self, grey: UInt8) -> Candidates:
-        """Everything in a grey image that is enough like a design to be fitted."""
-        known = bank(self.patches)
-        picture = Picture(grey)
-        raw, smooth = picture.raw, picture.smooth
-        poses = sectors.search(smooth, *_places(raw[0], smooth), known, margin=0.2)
-        poses = poses[poses.ncc > 0.62]
-        for steps, least in ((1, 0.72), (1, 0.8), (3, CORE)):
-            poses = align(smooth, poses, known.core, steps, 0.9 * sectors.RING_PX)
-            poses = poses[poses.ncc > least]
+        """Return the fits of all places in a grey image that are enough like a design."""
+        templates, pyramids = build_templates(self.patches), Pyramids(grey)
+        raw, smooth = pyramids.raw, pyramids.smooth
+        poses = search_sectors(smooth, *_find_places(raw[0], smooth), templates, THRESHOLDS.margin)
+        poses = poses[poses.ncc > THRESHOLDS.search_ncc]
+        for steps, least_ncc in zip(THRESHOLDS.align_steps, THRESHOLDS.align_ncc, strict=True):
+            poses = align_poses(smooth, poses, templates.core, steps, THRESHOLDS.align_radius * CORE_RADIUS_PX)
+            poses = poses[poses.ncc > least_ncc]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
-        core = poses[_distinct(poses)[: max(MOST, MOST * grey.size // (640 * 480))]]
-        row, turned = sectors.alike(sectors.extend(smooth, core, known), known)
-        whole = align(smooth, turned, known.whole, 4, WHOLE_PX)
-        best = np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]  # of the rotations of each
-        whole = whole[best]
-        sure = sectors.likeness(core.ncc, whole.ncc) > LIKENESS
-        core, whole = core[sure], whole[sure]
-        fit = refine.fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.which])
-        return Candidates(whole.which, core.ncc, whole.ncc, fit, picture.noise, picture.range)
+        most = THRESHOLDS.most_candidates
+        core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
+        row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
+        whole = align_poses(smooth, rotated, templates.whole, THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
+        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # the best rotation of each
+        alike = WEIGHTS.likeness(core.ncc, whole.ncc) > THRESHOLDS.likeness
+        core, whole = core[alike], whole[alike]
+        fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
+        return Candidates(whole.design, core.ncc, whole.ncc, fits, pyramids.noise, pyramids.grey_range)
 
 
-def _places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
-    """Crossings of four octaves: (n, 2) px of the image, and the octave of each."""
-    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1:4]]
-    xy = [crossings(level)[0] for level in levels]
-    return np.concatenate([points * 2**n for n, points in enumerate(xy)]), np.repeat(
-        np.arange(len(xy)), [len(points) for points in xy]
-    )
+def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
+    """Return crossings of several octaves: (n, 2) px of the image, and the octave (n,) of each."""
+    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1 : THRESHOLDS.octaves]]
+    xy = [find_crossings(level)[0] for level in levels]
+    octave = np.repeat(np.arange(len(xy)), [len(points) for points in xy])
+    return np.concatenate([points * 2**n for n, points in enumerate(xy)]), octave
 
 
-def _distinct(poses: Poses) -> Int:
-    """Indices of poses, best first, without those that repeat a better one of the same or of a much better design."""
+def _select_distinct(poses: Poses) -> Int:
+    """Return indices of poses, best first; near a better pose only a nearly as good pose of another design is kept."""
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
-    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < 0.7
+    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < THRESHOLDS.near
     near |= near.T
-    rival = near & ((poses.which[:, None] == poses.which) | (poses.ncc[:, None] > poses.ncc + 0.05))
+    much_better = poses.ncc[:, None] > poses.ncc + THRESHOLDS.much_better_ncc
+    rival = near & ((poses.design[:, None] == poses.design) | much_better)
     kept = np.zeros(n, bool)
     for k in range(n):
         kept[k] = not np.any(rival[kept, k])
     return np.flatnonzero(kept)
 
 
-def _uncovered(xy: Float, A: Float, reach: float) -> Int:
-    """Indices of points, best first, that lie in no better one's disc, scaled by ``reach``."""
-    inside = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None]), axis=2) < reach
+def _select_uncovered(xy: Float, A: Float) -> Int:
+    """Return indices of points, best first, that do not lie in the disc of a better point."""
+    offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
+    inside = np.linalg.norm(offset, axis=2) < THRESHOLDS.disc_share
     kept = np.zeros(len(xy), bool)
     for k in range(len(xy)):
         kept[k] = not np.any(inside[kept, k])

@@ -1,4 +1,4 @@
-"""An image at half its size again and again, and its values at many places."""
+"""Image pyramids, and grey values of an image at many places at once."""
 
 from __future__ import annotations
 
@@ -10,58 +10,112 @@ from numpy.typing import NDArray
 
 from kpbench.types import Float, Float32, Int, UInt8
 
+MOST_LEVELS, LEAST_SIDE_PX = 7, 16
+"""A pyramid has at most so many levels; a level whose shorter side is under ``LEAST_SIDE_PX`` is the last one."""
+REMAP_ROWS = 2**14
+"""Rows that are sampled in one call: OpenCV's remap takes fewer than 2**15."""
+LEAST_DEVIATION = 1.0
+"""Grey levels. Regularises correlations: on a surface whose standard deviation is far below this they are near 0."""
 
-def pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
-    """Octaves of a grey image; pixel (x, y) of level l lies at (x, y)·2^l of the image.
 
-    Each level is smoothed by about ``smooth_px`` of its own px.
+def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
+    """Return the octaves of a grey image, finest first.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W), uint8
+    smooth_px : float
+        Standard deviation of the Gaussian that smooths level 0, px. Each further level is smoothed by about as many
+        of its own px, whatever this value is. 0 leaves level 0 as it is.
+
+    Returns
+    -------
+    list of ndarray, float32
+        Each level has half the size of the level before. Pixel (x, y) of level n lies at (x, y)·2^n of the image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.fitting import build_pyramid
+    >>> [level.shape for level in build_pyramid(np.zeros((48, 64), np.uint8))]
+    [(48, 64), (24, 32), (12, 16)]
     """
     levels = [image.astype(np.float32)]
     if smooth_px:
         levels[0] = np.asarray(cv2.GaussianBlur(levels[0], (0, 0), smooth_px))
-    while min(levels[-1].shape) >= 16 and len(levels) < 7:
+    while min(levels[-1].shape) >= LEAST_SIDE_PX and len(levels) < MOST_LEVELS:
         levels.append(np.asarray(cv2.pyrDown(levels[-1])))
     return levels
 
 
-class Picture:
-    """A grey image and what is needed of it again and again.
+class Pyramids:
+    """The two pyramids of a grey image, and two measures of the image.
 
     Attributes
     ----------
-    raw, smooth : its :func:`pyramid`, as it is and smoothed.
-    noise : standard deviation, grey levels, from the median of second differences, which edges hardly move.
-    range : grey levels between its dark and its bright parts.
+    raw, smooth : list of ndarray, float32
+        :func:`build_pyramid` of the image, without and with smoothing of level 0.
+    noise : float
+        Standard deviation of the image's noise, grey levels. It is estimated from the median of second differences,
+        which edges hardly move.
+    grey_range : float
+        Difference between the bright and the dark parts of the image (98th and 2nd percentile), grey levels.
     """
 
     def __init__(self, grey: UInt8) -> None:
-        self.raw, self.smooth = pyramid(grey, 0), pyramid(grey)
+        self.raw, self.smooth = build_pyramid(grey, 0), build_pyramid(grey)
         kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # of whole numbers the median takes less time
+        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # the median of integers takes less time
         self.noise = 1.4826 / 6 * float(np.median(np.abs(differences)))
         dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-        self.range = float(bright - dark)
+        self.grey_range = float(bright - dark)
 
 
-MOST_ROWS = 2**14
-"""Rows that are sampled at once: OpenCV's remap takes fewer than 2**15."""
+def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, points: Float) -> Float32:
+    """Return bilinear grey values at ``xy + A @ points`` px of the image, for N poses.
 
+    Parameters
+    ----------
+    levels : list of ndarray
+        From :func:`build_pyramid`.
+    level : ndarray of shape (N,), int64
+        Level that each pose is sampled from.
+    xy, A : ndarray of shape (N, 2) and (N, 2, 2)
+        Poses, px of the image.
+    points : ndarray of shape (M, 2)
+        Points in the frame of the poses.
 
-def sample(levels: Sequence[Float32], level: Int, xy: Float, A: Float, points: Float) -> Float32:
-    """Bilinear grey values (N, M) at ``xy + A @ points`` px of the image, each row from a level of its own."""
+    Returns
+    -------
+    ndarray of shape (N, M), float32
+        Outside the image the border is repeated.
+    """
     values = np.empty((len(xy), len(points)), np.float32)
     fan = points.T.astype(np.float32)
     for n in np.unique(level):
-        whole = np.flatnonzero(level == n)
-        for rows in np.split(whole, range(MOST_ROWS, len(whole), MOST_ROWS)):
-            at, map_ = (xy[rows] * 0.5**n).astype(np.float32), (A[rows] * 0.5**n).astype(np.float32)
-            x, y = (map_[:, axis] @ fan + at[:, axis : axis + 1] for axis in (0, 1))
+        of_level = np.flatnonzero(level == n)
+        for rows in np.split(of_level, range(REMAP_ROWS, len(of_level), REMAP_ROWS)):
+            centre, map_ = (xy[rows] * 0.5**n).astype(np.float32), (A[rows] * 0.5**n).astype(np.float32)
+            x, y = (map_[:, axis] @ fan + centre[:, axis : axis + 1] for axis in (0, 1))
             values[rows] = cv2.remap(levels[n], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values
 
 
-def outside_image(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Int, NDArray[np.bool_]]:
-    """Rows that have samples outside the image, and which ones: (K,) and (K, M)."""
+def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Int, NDArray[np.bool_]]:
+    """Return the poses that have samples outside the image, and which samples these are.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W)
+    xy, A, points : ndarray
+        As for :func:`sample_pyramid`.
+
+    Returns
+    -------
+    rows : ndarray of shape (K,), int64
+        Indices of poses.
+    outside : ndarray of shape (K, M), bool
+    """
     last = np.array(image.shape[::-1]) - 1.0
     reach = np.linalg.norm(A, axis=2) * np.linalg.norm(points, axis=1).max()
     rows = np.flatnonzero(np.any((xy - reach < 0) | (xy + reach > last), axis=1))
@@ -69,18 +123,14 @@ def outside_image(image: Float32, xy: Float, A: Float, points: Float) -> tuple[I
     return rows, (x < 0) | (y < 0) | (x > last[0]) | (y > last[1])
 
 
-FLOOR = 1.0
-"""Grey levels; a standard deviation around a place that is under it counts as nothing."""
-
-
-def normalise(values: Float32) -> Float32:
-    """Zero mean and unit norm a row."""
+def normalise_rows(values: Float32) -> Float32:
+    """Return rows (N, M) of grey values with zero mean and unit norm; even surfaces come out near 0."""
     centred = values - values.mean(axis=1, keepdims=True)
-    size = np.einsum("nm,nm->n", centred, centred) + np.float32(FLOOR**2 * values.shape[1])
+    size = np.einsum("nm,nm->n", centred, centred) + np.float32(LEAST_DEVIATION**2 * values.shape[1])
     return np.asarray(centred / np.sqrt(size)[:, None])
 
 
-def coarsest_level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Int:
-    """The coarsest pyramid level in which a radius still measures ``least_px``."""
+def choose_level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Int:
+    """Return the coarsest level (N,) in which a radius (N,) of the image still measures ``least_px`` px."""
     octave = np.floor(np.log2(np.maximum(radius_px, 1e-6) / least_px))
     return np.clip(octave, 0, len(levels) - 1).astype(np.int64)

@@ -1,8 +1,10 @@
-"""Poses of patches from a rough place and scale alone, by their innermost sectors, which look the same at every size.
+"""Poses of designs from a rough place and scale alone.
 
-:func:`search` samples the image on circles around the place, under a bank of tilts, and correlates with the sectors
-of every design in every rotation; :func:`kpbench.fitting.align` moves what it finds onto the image; :func:`extend`
-measures how far the sectors reach, which is the patch's size.
+The search uses the innermost sectors of a design, which look the same at every size. :func:`search_sectors` samples
+circles around each place under many tilts and correlates them with the sectors of each design in each rotation.
+:func:`kpbench.fitting.align.align_poses` moves the result onto the image. :func:`estimate_size` then measures how far
+the sectors reach, which is the size of the patch, and :func:`core_symmetries` adds the rotations that only the whole
+design tells apart.
 """
 
 from __future__ import annotations
@@ -14,26 +16,43 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from kpbench.fitting.align import Poses, rotated, short_axis
-from kpbench.fitting.pyramid import coarsest_level, normalise, outside_image, sample
-from kpbench.fitting.templates import ANGLES, TURNS, Bank, look_up, soft_ink
+from kpbench.fitting.align import Poses, rotate_poses, short_semi_axis
+from kpbench.fitting.pyramid import choose_level, find_samples_outside, normalise_rows, sample_pyramid
+from kpbench.fitting.templates import (
+    CORE_ROTATIONS,
+    WHOLE_ROTATIONS,
+    DesignTemplates,
+    draw_ink,
+    look_up_ink,
+)
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
-RING_PX = 3.0
-"""Short semi-axis of the core's outermost ring, in px of the level: well inside the smallest patch's (5 px)."""
-
-
-def likeness(core: Float, whole: Float) -> Float:
-    """What the correlations near the centre and over the disc are worth, in units of log odds."""
-    return np.asarray(-2.13 * np.log(1.01 - core) - 2.59 * np.log(1.01 - whole))
+CORE_RADIUS_PX = 3.0
+"""Short semi-axis of the core's circle, px of the level that is searched. The smallest patches have 5 px."""
+SPOKES = 40
+"""Samples on each circle of :func:`estimate_size`."""
+RING_RADII = 0.7 * 1.12 ** np.arange(34)
+"""Radii of these circles, in radii of the core's circle."""
+FIRST_RINGS = 12
+"""Circles of a first look, which ends the measurement at most places that are no patch."""
+AGREEING_SHARE = 0.7
+"""A circle belongs to the patch if at least this share of its votes is for the predicted ink."""
+VOTING_SHARE = 0.3
+"""A circle belongs to the patch if at least this share of its samples votes for the predicted ink."""
+VOTE_OFFSET = 0.4
+"""Subtracted from the agreement (-1 to 1) of each sample: a sample must agree more than this to count in favour."""
+BLOCK = 2**11
+"""Poses that are measured together: memory does not grow with the image."""
+_TILTS = ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9))
+"""Ratio of short to long semi-axis of the tilts that are searched, and the number of directions for each."""
 
 
 @lru_cache(maxsize=1)
-def _tilts() -> Float:
-    """Affine maps (K, 2, 2) whose circle has a short semi-axis of 1: long ones of 1 to 4.5 in all directions."""
+def _tilt_maps() -> Float:
+    """Return affine maps (K, 2, 2) of the unit circle to ellipses with a short semi-axis of 1, one map per tilt."""
     maps = []
-    for ratio, directions in ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9)):
+    for ratio, directions in _TILTS:
         for direction in np.arange(directions) * np.pi / directions:
             c, s = np.cos(direction), np.sin(direction)
             axes = np.array([[c, -s], [s, c]])
@@ -41,157 +60,176 @@ def _tilts() -> Float:
     return np.array(maps)
 
 
-def search(levels: Sequence[Float32], xy: Float, level: Int, known: Bank, margin: float) -> Poses:
-    """Best tilt and rotation of each design at each place.
+def search_sectors(
+    levels: Sequence[Float32], xy: Float, level: Int, templates: DesignTemplates, margin: float
+) -> Poses:
+    """Find the best tilt and rotation of each design at each place.
 
     Parameters
     ----------
-    levels : from :func:`kpbench.fitting.pyramid`.
-    xy : (N, 2) px.
-    level : (N,) pyramid level to look at; the circle has a short semi-axis of ``3 · 2^level`` px.
-    known : the designs.
-    margin : designs whose correlation is worse by more than this than the best one's are left out.
+    levels : list of ndarray
+        From :func:`kpbench.fitting.pyramid.build_pyramid`.
+    xy : ndarray of shape (N, 2)
+        Places, px.
+    level : ndarray of shape (N,), int64
+        Pyramid level to search; the core's circle has a short semi-axis of ``CORE_RADIUS_PX · 2^level`` px.
+    templates : DesignTemplates
+    margin : float
+        Designs whose correlation is lower than the best one's by more than this are left out.
 
     Returns
     -------
     Poses
-        One to D a place, in the order of the places (all D where ``margin`` is infinite);
-        ``A`` maps the unit circle of ``known.core``.
+        One or more designs per place, in the order of the places; ``A`` maps the unit circle of the core.
     """
-    core, scale = known.core, RING_PX * 2.0**level
-    starts = np.searchsorted(core.turned_which, np.arange(len(known.patches)))
-    best = np.full((len(known.patches), len(xy)), -1.0, np.float32)
+    core, scale = templates.core, CORE_RADIUS_PX * 2.0**level
+    starts = np.searchsorted(core.rotated_design, np.arange(len(templates.patches)))
+    best = np.full((len(templates.patches), len(xy)), -1.0, np.float32)
     tilt = np.zeros(best.shape, np.int64)
-    for k, map_ in enumerate(_tilts()):
-        values = sample(levels, level, xy, scale[:, None, None] * map_, core.points)
-        value = np.maximum.reduceat(core.turned @ normalise(values).T, starts, axis=0)
+    for k, map_ in enumerate(_tilt_maps()):
+        values = sample_pyramid(levels, level, xy, scale[:, None, None] * map_, core.points)
+        value = np.maximum.reduceat(core.rotated @ normalise_rows(values).T, starts, axis=0)
         better = value > best
         best[better], tilt[better] = value[better], k
-    place, which = np.nonzero((best >= best.max(axis=0) - margin).T)
-    A = scale[place, None, None] * _tilts()[tilt[which, place]]
-    ncc = normalise(sample(levels, level[place], xy[place], A, core.points)) @ core.turned.T
-    best = np.where(core.turned_which == which[:, None], ncc, -np.inf).argmax(axis=1)
-    return rotated(xy[place], A, which, best, ncc, core)
+    place, design = np.nonzero((best >= best.max(axis=0) - margin).T)
+    A = scale[place, None, None] * _tilt_maps()[tilt[design, place]]
+    ncc = normalise_rows(sample_pyramid(levels, level[place], xy[place], A, core.points)) @ core.rotated.T
+    rotation = np.where(core.rotated_design == design[:, None], ncc, -np.inf).argmax(axis=1)
+    return rotate_poses(xy[place], A, design, rotation, ncc, core)
 
 
-SPOKES = 40
-RADII = 0.7 * 1.12 ** np.arange(34)
-"""Radii at which :func:`extend` looks, in radii of the circle that was aligned."""
-AGREE = 0.7
-"""Fraction of a circle's samples that must have the predicted ink for it to belong to the patch."""
+def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemplates) -> Poses:
+    """Measure how far the sectors reach, and turn poses of the core into poses of the unit disc.
 
-
-def extend(levels: Sequence[Float32], poses: Poses, known: Bank) -> Poses:
-    """How far the sectors reach: turn poses of the core into poses of the unit disc.
-
-    Each sample on the spokes of a wheel votes for or against the ink that the sectors predict; the ellipse
-    with the largest sum of votes is the sectors' edge. Two edges leave the stretch along each of them open,
-    so ellipses are tried that differ in it; three or more edges leave the size alone.
+    Circles of growing size are sampled around each place. Each sample votes for or against the ink that the sectors
+    predict. The ellipse with the largest sum of votes is the outer edge of the sectors. A design with two edges looks
+    the same when it is stretched along them, so ellipses of several stretches are tried; a design with three or more
+    edges fixes its stretch.
     """
     A = poses.A.copy()
     for rows in np.split(np.arange(len(poses)), range(BLOCK, len(poses), BLOCK)):
-        # most places are no patch, and end at once
-        A[rows], ended = _reach(levels, poses[rows], known, NEAR)
-        far = rows[~ended]
-        A[far], _ = _reach(levels, poses[far], known, len(RADII))
-    return Poses(poses.xy, A, poses.which, poses.ncc)
+        A[rows], complete = _fit_edge(levels, poses[rows], templates, FIRST_RINGS)
+        rest = rows[~complete]
+        A[rest], _ = _fit_edge(levels, poses[rest], templates, len(RING_RADII))
+    return Poses(poses.xy, A, poses.design, poses.ncc)
 
 
-def alike(poses: Poses, known: Bank) -> tuple[Int, Poses]:
-    """Poses in every rotation in which the innermost sectors look the same and the whole design does not.
+def core_symmetries(poses: Poses, templates: DesignTemplates) -> tuple[Int, Poses]:
+    """Return the poses in every rotation in which the core looks the same but the whole design does not.
 
     Returns
     -------
-    Rows (M,) of the given poses, in order and each once or more, and their poses.
+    row : ndarray of shape (M,), int64
+        Index of the given pose of each, in order; each given pose occurs once or more.
+    poses : Poses
+        M poses.
     """
-    core, whole = (np.bincount(t.turned_which, minlength=len(known.patches)) for t in (known.core, known.whole))
-    # of a design that looks the same n times in a turn one in n rotations is listed
-    period = 2 * np.pi * core / ANGLES
-    many = np.maximum(np.rint(ANGLES / core / (TURNS / whole)), 1).astype(np.int64)
-    row = np.repeat(np.arange(len(poses)), many[poses.which])
+    core, whole = (
+        np.bincount(kind.rotated_design, minlength=len(templates.patches)) for kind in (templates.core, templates.whole)
+    )
+    # the templates of a design that looks the same n times in a turn hold one in n of all rotations
+    period = 2 * np.pi * core / CORE_ROTATIONS
+    symmetries = np.maximum(np.rint(CORE_ROTATIONS / core / (WHOLE_ROTATIONS / whole)), 1).astype(np.int64)
+    row = np.repeat(np.arange(len(poses)), symmetries[poses.design])
     first = np.searchsorted(row, row)
-    angle = (np.arange(len(row)) - first) * period[poses.which[row]]
+    angle = (np.arange(len(row)) - first) * period[poses.design[row]]
     c, s = np.cos(angle), np.sin(angle)
-    turned = poses[row]
-    return row, Poses(turned.xy, turned.A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0), turned.which, turned.ncc)
+    given = poses[row]
+    return row, Poses(given.xy, given.A @ np.moveaxis(np.array([[c, -s], [s, c]]), 2, 0), given.design, given.ncc)
 
 
-NEAR = 12
-"""Radii of a first look."""
-BLOCK = 2**11
-"""Poses at once: memory does not grow with the image."""
+def _fit_edge(
+    levels: Sequence[Float32], poses: Poses, templates: DesignTemplates, count: int
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Fit the outer edge of the sectors within the first ``count`` circles.
 
-
-def _reach(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> tuple[Float, NDArray[np.bool_]]:
-    """Maps (N, 2, 2) of the unit disc, looking at so many radii, and whether more of them would change nothing (N,)."""
-    votes = _votes(levels, poses, known, count)
-    summed = votes * (RADII * np.gradient(RADII)).astype(np.float32)[:count, None]
+    Returns
+    -------
+    A : ndarray of shape (N, 2, 2)
+        Maps of the unit disc, px.
+    complete : ndarray of shape (N,), bool
+        Whether more circles would change nothing.
+    """
+    votes = _vote(levels, poses, templates, count)
+    summed = votes * (RING_RADII * np.gradient(RING_RADII)).astype(np.float32)[:count, None]
     for ring in range(1, count):  # np.cumsum takes four times as long
         summed[:, ring] += summed[:, ring - 1]
-    A, ended = poses.A.copy(), np.zeros(len(poses), bool)
-    for d, patch in enumerate(known.patches):
-        rows = np.flatnonzero(poses.which == d)
-        shapes, ends, certain = _ellipses(patch, count)
-        # (radii x spokes, rows) of what the votes add up to, those in favour, and all that were cast
+    A, complete = poses.A.copy(), np.zeros(len(poses), bool)
+    for d, patch in enumerate(templates.patches):
+        rows = np.flatnonzero(poses.design == d)
+        shapes, ends, known = _ellipse_ends(patch, count)
+        # (circles x spokes, poses): sums of votes, votes in favour, all votes
         tables = [t[rows].reshape(len(rows), count * SPOKES).T for t in (summed, votes > 0, votes != 0)]
-        total, yes, cast = (
+        total, agreeing, cast = (
             (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), count) for t in tables
         )
-        # beyond the first circle that disagrees, what agrees is chance
-        alien = np.logical_or.accumulate((yes < AGREE * cast) | (yes < 0.3 * SPOKES), axis=2)
-        alien[:, :, 0] = False
-        ended[rows] = alien[:, :, certain].all(axis=1)
-        best = np.where(alien, -np.inf, total).reshape(len(rows), len(shapes) * count).argmax(axis=1)
+        # beyond the first circle that disagrees, agreement is chance
+        beyond = np.logical_or.accumulate(
+            (agreeing < AGREEING_SHARE * cast) | (agreeing < VOTING_SHARE * SPOKES), axis=2
+        )
+        beyond[:, :, 0] = False
+        complete[rows] = beyond[:, :, known].all(axis=1)
+        best = np.where(beyond, -np.inf, total).reshape(len(rows), len(shapes) * count).argmax(axis=1)
         shape, size = np.unravel_index(best, (len(shapes), count))
-        A[rows] = A[rows] @ (shapes[shape] * RADII[size][:, None, None]) / patch.cells[0][1]
-    return A, ended
+        A[rows] = A[rows] @ (shapes[shape] * RING_RADII[size][:, None, None]) / patch.cells[0][1]
+    return A, complete
 
 
-def _votes(levels: Sequence[Float32], poses: Poses, known: Bank, count: int) -> Float32:
-    """From -1.4 (the other ink) to 0.6 (the predicted ink), 0 outside the image: (N, radii, spokes)."""
-    spokes, radii = _spokes(), RADII[:count]
-    ink = np.array([look_up(soft_ink(p, False), spokes) for p in known.patches], np.float32)
-    predicted = ink[poses.which][:, None]
+def _vote(levels: Sequence[Float32], poses: Poses, templates: DesignTemplates, count: int) -> Float32:
+    """Return the votes (N, circles, spokes): from -1.4 (the other ink) to 0.6 (the predicted ink); 0 outside."""
+    spokes, radii = _spoke_points(), RING_RADII[:count]
+    ink = np.array([look_up_ink(draw_ink(patch, False), spokes) for patch in templates.patches], np.float32)
+    predicted = ink[poses.design][:, None]
     shape = (len(poses), len(radii), len(spokes))
     xy = np.repeat(poses.xy, len(radii), axis=0)
     A = (poses.A[:, None] * radii[:, None, None]).reshape(-1, 2, 2)
-    grey = sample(levels, coarsest_level(short_axis(A), RING_PX, levels), xy, A, spokes).reshape(shape)
+    level = choose_level(short_semi_axis(A), CORE_RADIUS_PX, levels)
+    grey = sample_pyramid(levels, level, xy, A, spokes).reshape(shape)
     core = grey[:, radii <= 1.0].mean(axis=1)
     light = predicted[:, 0] > 0
     white = (core * light).sum(axis=1) / light.sum(axis=1)
     black = (core * ~light).sum(axis=1) / (~light).sum(axis=1)
     middle, half = (white + black) / 2, np.maximum((white - black) / 2, 1.0)
-    agree = grey - middle.astype(np.float32)[:, None, None]
-    agree *= np.sign(predicted) / half.astype(np.float32)[:, None, None]
-    np.clip(agree, -1, 1, out=agree)
-    agree -= np.float32(0.4)
-    votes: Float32 = agree * np.abs(predicted)
-    rows, outside = outside_image(levels[0], xy, A, spokes)
+    agreement = grey - middle.astype(np.float32)[:, None, None]
+    agreement *= np.sign(predicted) / half.astype(np.float32)[:, None, None]
+    np.clip(agreement, -1, 1, out=agreement)
+    agreement -= np.float32(VOTE_OFFSET)
+    votes: Float32 = agreement * np.abs(predicted)
+    rows, outside = find_samples_outside(levels[0], xy, A, spokes)
     votes.reshape(-1, len(spokes))[rows] *= ~outside
     return votes
 
 
 @lru_cache(maxsize=64)
-def _ellipses(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
-    """Shapes (G, 2, 2) to try, samples where each ends (G x radii, radii x spokes), last radius at which all do."""
-    shapes = _stretches(patch)
-    reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spokes()), axis=2)
-    shift = np.rint(np.log(reach) / np.log(RADII[1] / RADII[0])).astype(np.int64)
-    ring = np.clip(np.arange(count)[:, None] + shift[:, None], 0, count - 1)  # (G, radii, spokes)
+def _ellipse_ends(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
+    """Return the shapes of ellipses that are tried, and the samples at which each ellipse ends.
+
+    Returns
+    -------
+    shapes : ndarray of shape (G, 2, 2)
+    ends : sparse array of shape (G · circles, circles · spokes)
+        1 at the samples where the ellipse of a shape and size ends.
+    known : int
+        Last circle at which all ellipses end within the circles that were sampled.
+    """
+    shapes = _stretches_along_edges(patch)
+    reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spoke_points()), axis=2)
+    shift = np.rint(np.log(reach) / np.log(RING_RADII[1] / RING_RADII[0])).astype(np.int64)
+    ring = np.clip(np.arange(count)[:, None] + shift[:, None], 0, count - 1)  # (G, circles, spokes)
     column = (ring * SPOKES + np.arange(SPOKES)).ravel()
     row = np.repeat(np.arange(len(column) // SPOKES), SPOKES)
     ends = csr_array((np.ones(len(column), np.float32), (row, column)), (row[-1] + 1, count * SPOKES))
     return shapes, ends, max(count - 1 - int(shift.max()), 0)
 
 
-def _spokes() -> Float:
-    turn = np.arange(SPOKES) * (2 * np.pi / SPOKES)
-    return np.column_stack([np.cos(turn), np.sin(turn)])
+def _spoke_points() -> Float:
+    angle = np.arange(SPOKES) * (2 * np.pi / SPOKES)
+    return np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 @lru_cache(maxsize=64)
-def _stretches(patch: Patch) -> Float:
-    """Maps (G, 2, 2) of the patch frame that leave the innermost edges where they are, of determinant 1."""
+def _stretches_along_edges(patch: Patch) -> Float:
+    """Return maps (G, 2, 2) of the patch frame, of determinant 1, that leave the innermost edges where they are."""
     _, angles, black = patch.cells
     edges = np.unique(np.round(angles[black[0] != np.roll(black[0], 1)] % 180.0, 6))
     if len(edges) > 2:

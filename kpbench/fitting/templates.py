@@ -1,13 +1,7 @@
-"""Designs as templates: what an image shows of them, in every rotation.
+"""Designs as templates: their inks at sample points, in every rotation.
 
-Poses are affine: ``x_px = xy + A @ u``. :mod:`kpbench.fitting` compares them with an image in three steps, each for
-many candidates at once:
-
-* :func:`rotate_within_ellipse` finds the rotation where the ellipse is known;
-* :func:`align` moves a pose onto the image, by the whole design or by its innermost sectors;
-* :func:`rectify` shows the image in the frame of the patch.
-
-Where not even the ellipse is known, ``sector_search`` finds it.
+Two kinds of templates are compared with an image. The *core* is the innermost sectors of a design; sectors through the
+centre look the same at every size. The *whole* is the design out to its rim.
 """
 
 from __future__ import annotations
@@ -23,91 +17,116 @@ from numpy.typing import NDArray
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
-ANGLES = 24
-_turn = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-_circle = np.column_stack([np.cos(_turn), np.sin(_turn)])
+CORE_ROTATIONS = 24
+"""Rotations of the core that are tried, and samples on each circle of a template."""
+WHOLE_ROTATIONS = 72
+"""Rotations of the whole design that are tried: right to 2.5 degrees, where a fit can start."""
+CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
+"""Radii of the circles that are sampled; 1 is the core's own circle, or the rim of the disc."""
+CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
+"""Standard deviation of a template's blur, in the same radii: it matches the smoothing of the image pyramid."""
+SAME_NCC = 0.998
+"""Two rotations of a design that correlate by at least this look the same; only the first of them is kept."""
+VIEW_REACH = 1.7
+"""Half the side of a view, in radii of the disc: a view shows the disc and the ground around it."""
+VIEW_PX = 32
+"""Side of a view, px."""
+_INK_PX = 273
+"""Side of an ink image, px; it has the reach of a view."""
+_angles_rad = np.arange(CORE_ROTATIONS) * (2 * np.pi / CORE_ROTATIONS)
+_circle = np.column_stack([np.cos(_angles_rad), np.sin(_angles_rad)])
 
 
 @dataclass(frozen=True)
 class Templates:
-    """D designs sampled at M points on circles.
+    """D designs, sampled at M points on circles.
 
     Attributes
     ----------
-    points : (M, 2)
-    ink : (D, M) zero mean, unit norm.
-    solve : (D, 6, M) from a difference of templates to a step in (x, y, a11, a12, a21, a22).
-    sized : (D,) whether the pattern has a size of its own, which sectors have not.
-    turned : (R, M) all rotations of all inks, without those that look alike.
-    turned_which, turned_angle : (R,) the design and the rotation in radians of each.
+    points : ndarray of shape (M, 2)
+        Sample points in the frame of the template.
+    ink : ndarray of shape (D, M), float32
+        Zero mean and unit norm per design.
+    solve : ndarray of shape (D, 6, M), float32
+        Maps a difference of templates to a Gauss-Newton step in (x, y, a11, a12, a21, a22).
+    has_size : ndarray of shape (D,), bool
+        Whether the template changes with its size; sectors do not.
+    rotated : ndarray of shape (R, M), float32
+        Inks of all designs in all rotations, without rotations that look like an earlier one.
+    rotated_design : ndarray of shape (R,), int64
+        Index of the design of each.
+    rotated_angle : ndarray of shape (R,)
+        Rotation of each, rad.
     """
 
     points: Float
     ink: Float32
     solve: Float32
-    sized: NDArray[np.bool_]
-    turned: Float32
-    turned_which: Int
-    turned_angle: Float
+    has_size: NDArray[np.bool_]
+    rotated: Float32
+    rotated_design: Int
+    rotated_angle: Float
 
 
 @dataclass(frozen=True)
-class Bank:
-    """What the coarse stages need of a set of designs.
+class DesignTemplates:
+    """All templates of a set of D designs.
 
     Attributes
     ----------
-    patches : the designs.
-    core : the innermost sectors, over the unit disc; they look the same at every size.
-    whole : the whole design, over the unit disc.
-    picture : (D, VIEW_PX²) the designs as :func:`rectify` shows them, white 1 and black -1.
+    patches : tuple of Patch
+        The designs.
+    core, whole : Templates
+        Innermost sectors, on the unit circle; whole designs, on the unit disc.
+    view : ndarray of shape (D, VIEW_PX²), float32
+        Each design as :func:`kpbench.fitting.views.rectify` shows it: white 1, black -1.
     """
 
     patches: tuple[Patch, ...]
     core: Templates
     whole: Templates
-    picture: Float32
+    view: Float32
 
 
-def bank(patches: Sequence[Patch]) -> Bank:
-    """Templates of some designs."""
-    return _bank(tuple(patches))
+def build_templates(patches: Sequence[Patch]) -> DesignTemplates:
+    """Return the templates of a set of designs; they are kept for the next call."""
+    return _build_templates(tuple(patches))
 
 
 @lru_cache(maxsize=8)
-def _bank(patches: tuple[Patch, ...]) -> Bank:
-    core = _templates(patches, (0.4, 0.7, 1.0), whole=False)
-    whole = _templates(patches, (0.25, 0.45, 0.65, 0.85), whole=True)
-    picture = np.array([look_up(soft_ink(patch, True), view_points()) for patch in patches], np.float32)
-    return Bank(patches, core, whole, picture)
+def _build_templates(patches: tuple[Patch, ...]) -> DesignTemplates:
+    core = _sample_designs(patches, CORE_RINGS, whole=False)
+    whole = _sample_designs(patches, WHOLE_RINGS, whole=True)
+    view = np.array([look_up_ink(draw_ink(patch, True), view_points()) for patch in patches], np.float32)
+    return DesignTemplates(patches, core, whole, view)
 
 
-def _templates(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
+def _sample_designs(patches: Sequence[Patch], rings: Sequence[float], whole: bool) -> Templates:
     points = np.concatenate([r * _circle for r in rings])
-    pairs = [_template(soft_ink(patch, whole), points) for patch in patches]
+    pairs = [_linearise(draw_ink(patch, whole), points) for patch in patches]
     ink, solve = (np.array(part, np.float32) for part in zip(*pairs, strict=True))
-    turned, which, angle, turns = [], [], [], TURNS if whole else ANGLES
+    rotated, design, angle, count = [], [], [], WHOLE_ROTATIONS if whole else CORE_ROTATIONS
     for n, patch in enumerate(patches):
-        image = soft_ink(patch, whole)
-        seen: list[Float32] = []
-        for turn in np.arange(turns) * (2 * np.pi / turns):
+        image = draw_ink(patch, whole)
+        kept: list[Float32] = []
+        for turn in np.arange(count) * (2 * np.pi / count):
             c, s = np.cos(turn), np.sin(turn)
-            grey = look_up(image, points @ np.array([[c, -s], [s, c]]))
-            one = ((grey - grey.mean()) / np.linalg.norm(grey - grey.mean())).astype(np.float32)
-            if all(one @ other < 0.998 for other in seen):
-                seen.append(one)
-                which.append(n)
+            grey = look_up_ink(image, points @ np.array([[c, -s], [s, c]]))
+            template = ((grey - grey.mean()) / np.linalg.norm(grey - grey.mean())).astype(np.float32)
+            if all(template @ other < SAME_NCC for other in kept):
+                kept.append(template)
+                design.append(n)
                 angle.append(turn)
-        turned += seen
-    sized = np.array([whole and len(patch.cells[0]) > 2 for patch in patches])
-    return Templates(points, ink, solve, sized, np.array(turned), np.array(which, np.int64), np.array(angle))
+        rotated += kept
+    has_size = np.array([whole and len(patch.cells[0]) > 2 for patch in patches])
+    return Templates(points, ink, solve, has_size, np.array(rotated), np.array(design, np.int64), np.array(angle))
 
 
-def _template(image: Float32, points: Float) -> tuple[Float, Float]:
-    """Normalised template and its Gauss-Newton solver."""
+def _linearise(image: Float32, points: Float) -> tuple[Float, Float]:
+    """Return the normalised template (M,) of an ink image and its Gauss-Newton solver (6, M)."""
     step = 0.05
-    ink = look_up(image, points)
-    du, dv = ((look_up(image, points + s) - look_up(image, points - s)) / (2 * step) for s in np.eye(2) * step)
+    ink = look_up_ink(image, points)
+    du, dv = ((look_up_ink(image, points + s) - look_up_ink(image, points - s)) / (2 * step) for s in np.eye(2) * step)
     u, v = points.T
     jacobian = np.column_stack([du, dv, du * u, du * v, dv * u, dv * v])
     ink = ink - ink.mean()
@@ -116,46 +135,40 @@ def _template(image: Float32, points: Float) -> tuple[Float, Float]:
     jacobian -= jacobian.mean(axis=0)  # grey offset and contrast are free
     jacobian -= np.outer(ink, ink @ jacobian)
     normal = jacobian.T @ jacobian
-    # stretch along two edges leaves sectors as they are: damping keeps it where it was
+    # sectors look the same when they are stretched along two edges: damping keeps that stretch where it was
     return ink, np.linalg.solve(normal + np.eye(6) * 0.02 * np.trace(normal) / 6, jacobian.T)
 
 
-LOOKUP_HALF, LOOKUP_SIZE = 1.7, 273
-SOFT_CORE, SOFT_WHOLE = 0.2, 0.12
-"""Blur of the templates, in radii of the circle: what remains after the pyramid's smoothing."""
-
-
 @lru_cache(maxsize=64)
-def soft_ink(patch: Patch, whole: bool) -> Float32:
-    """Ink, white 1 and black -1, over [-1.7, 1.7]²: the design, or its innermost sectors without end; blurred."""
+def draw_ink(patch: Patch, whole: bool) -> Float32:
+    """Return a blurred image of a design's ink, white 1 and black -1, over [-VIEW_REACH, VIEW_REACH]² of its frame.
+
+    Parameters
+    ----------
+    patch : Patch
+    whole : bool
+        True draws the design; its rim is continued outwards. False draws its innermost sectors, continued outwards.
+    """
     fine = 3
-    ticks = ((np.arange(LOOKUP_SIZE * fine) + 0.5) / (LOOKUP_SIZE * fine) * 2 - 1) * LOOKUP_HALF
+    ticks = ((np.arange(_INK_PX * fine) + 0.5) / (_INK_PX * fine) * 2 - 1) * VIEW_REACH
     points = np.stack(np.meshgrid(ticks, ticks), axis=-1)
-    # a point at radius r is seen at min(r, 0.999) of the design, or always near the centre
-    reach = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
-    end = np.minimum(reach, 0.999) if whole else 0.5 * patch.cells[0][1]
-    black = patch.is_black(points * (end / reach)[..., None])
-    ink = np.where(black, -1.0, 1.0).reshape(LOOKUP_SIZE, fine, LOOKUP_SIZE, fine).mean(axis=(1, 3))
-    blur = (SOFT_WHOLE if whole else SOFT_CORE) * LOOKUP_SIZE / (2 * LOOKUP_HALF)
+    # a point beyond the rim takes the ink at radius 0.999; for the sectors every point takes the ink near the centre
+    radius = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
+    looked_up = np.minimum(radius, 0.999) if whole else 0.5 * patch.cells[0][1]
+    black = patch.is_black(points * (looked_up / radius)[..., None])
+    ink = np.where(black, -1.0, 1.0).reshape(_INK_PX, fine, _INK_PX, fine).mean(axis=(1, 3))
+    blur = (WHOLE_BLUR if whole else CORE_BLUR) * _INK_PX / (2 * VIEW_REACH)
     return np.asarray(cv2.GaussianBlur(ink.astype(np.float32), (0, 0), blur))
 
 
-def look_up(image: Float32, points: Float) -> Float:
-    """Ink (N,) of :func:`soft_ink` at points (N, 2)."""
-    at = ((points + LOOKUP_HALF) / (2 * LOOKUP_HALF) * LOOKUP_SIZE - 0.5).astype(np.float32)
+def look_up_ink(image: Float32, points: Float) -> Float:
+    """Return the ink (N,) of an image from :func:`draw_ink` at points (N, 2) of the patch frame."""
+    at = ((points + VIEW_REACH) / (2 * VIEW_REACH) * _INK_PX - 0.5).astype(np.float32)
     return np.asarray(cv2.remap(image, at[:, :1], at[:, 1:], cv2.INTER_LINEAR), np.float64).ravel()
-
-
-TURNS = 72
-"""Rotations of the whole design that are tried: to within 2.5 degrees, where a fit can start."""
-
-
-VIEW_PX = 32
-"""Side of a view, which reaches from -1.7 to 1.7 in the patch frame: the disc and what surrounds it."""
 
 
 @lru_cache(maxsize=1)
 def view_points() -> Float:
-    """Return the places of a view's pixels in the patch frame, (VIEW_PX², 2), row by row."""
-    ticks = ((np.arange(VIEW_PX) + 0.5) / VIEW_PX * 2 - 1) * LOOKUP_HALF
+    """Return the centres of a view's pixels in the patch frame, (VIEW_PX², 2), row by row."""
+    ticks = ((np.arange(VIEW_PX) + 0.5) / VIEW_PX * 2 - 1) * VIEW_REACH
     return np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)

@@ -15,14 +15,14 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from kpbench.detectors.inference import open_session
-from kpbench.detectors.superpoint import SCHEMA
+from kpbench.detectors.superpoint import CELL_PX, SCHEMA
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
 from kpbench.training.checkpoint import network_of, read_checkpoint
-from kpbench.training.network import CELL, SuperPoint
+from kpbench.training.network import SuperPoint
 
 OPSET = 17
-LARGEST_DIFFERENCE = 1e-4
+MOST_DIFFERENCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             network,
-            (torch.zeros(1, 1, 8 * CELL, 8 * CELL),),
+            (torch.zeros(1, 1, 8 * CELL_PX, 8 * CELL_PX),),
             buffer,  # type: ignore[arg-type]
             dynamo=False,
             opset_version=OPSET,
@@ -74,7 +74,7 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
     return cast(bytes, model.SerializeToString())
 
 
-def export(checkpoint: str | Path, out: str | Path) -> Exported:
+def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     """Write a checkpoint's mean weights as an ONNX file and compare it with PyTorch.
 
     Raises
@@ -99,13 +99,14 @@ def export(checkpoint: str | Path, out: str | Path) -> Exported:
     with torch.inference_mode():
         expected = [part.numpy() for part in network(image)]
     data = to_onnx(fold(network), metadata)
-    difference = _difference(data, image.numpy(), expected)
-    if difference > LARGEST_DIFFERENCE:
+    difference = largest_difference(data, image.numpy(), expected)
+    if difference > MOST_DIFFERENCE:
         raise DataError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, expected at most 1e-4")
     write_atomic(Path(out), data)
     return Exported(len(data), content["step"], difference)
 
 
-def _difference(data: bytes, image: Any, expected: list[Any]) -> float:
+def largest_difference(data: bytes, image: Any, expected: list[Any]) -> float:
+    """Return the largest difference between the outputs of an ONNX model and expected outputs, for one image."""
     got = open_session(data)[0].run(None, {"image": image})
     return max(float(np.abs(a - b).max()) for a, b in zip(got, expected, strict=True))

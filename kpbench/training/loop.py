@@ -34,7 +34,7 @@ from kpbench.training.losses import losses, make_targets
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe, parse_recipe
 from kpbench.training.validation import evaluate, validation_set
-from kpbench.training.weights import grow, initial_weights, initialise, is_folded, unfold
+from kpbench.training.weights import grow, initial_weights, initialise, is_folded, restore_batchnorm
 
 SAVE_EVERY = 5.0
 """Minutes between checkpoints."""
@@ -309,7 +309,7 @@ def _begin_from(
     batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, count, recipe.phase(0)[1])
     images = _blob(torch.from_numpy(batch.images).to(device))
     if is_folded(weights):
-        unfold(given, [images])
+        restore_batchnorm(given, [images])
     return line if given is network else f"{line}; {grow(network, given, images, str(init))}"
 
 

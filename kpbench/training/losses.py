@@ -8,8 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kpbench.training.network import CELL
-from kpbench.training.recipe import Loss
+from kpbench.detectors.superpoint import CELL_PX
+from kpbench.training.recipe import LossConfig
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Targets:
 
 def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: str) -> Targets:
     """Targets of a batch of (B, K, 4) keypoints (:class:`kpbench.training.Batch`) on images of that size."""
-    count, h, w = len(keypoints), height // CELL, width // CELL
+    count, h, w = len(keypoints), height // CELL_PX, width // CELL_PX
     xy, patch, ignore = keypoints[..., :2], keypoints[..., 2], keypoints[..., 3]
     wanted = (patch >= 0) & (ignore == 0)
 
@@ -45,23 +45,23 @@ def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: st
         share = (part[..., 0] if dx else 1 - part[..., 0]) * (part[..., 1] if dy else 1 - part[..., 1])
         share = share * (wanted & (x >= 0) & (y >= 0) & (x < width) & (y < height))
         image.scatter_add_(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1), share)
-    pixels = image.view(count, h, CELL, w, CELL).permute(0, 2, 4, 1, 3).reshape(count, CELL * CELL, h, w)
+    pixels = image.view(count, h, CELL_PX, w, CELL_PX).permute(0, 2, 4, 1, 3).reshape(count, CELL_PX * CELL_PX, h, w)
     mass = pixels.sum(1, keepdim=True)
     pixels = pixels / mass.clamp(min=1.0)
     target = torch.cat([pixels, (1 - mass).clamp(min=0.0)], 1)
 
-    rows = torch.arange(h, device=keypoints.device) * CELL + (CELL - 1) / 2
-    columns = torch.arange(w, device=keypoints.device) * CELL + (CELL - 1) / 2
+    rows = torch.arange(h, device=keypoints.device) * CELL_PX + (CELL_PX - 1) / 2
+    columns = torch.arange(w, device=keypoints.device) * CELL_PX + (CELL_PX - 1) / 2
     distance = torch.hypot(xy[:, :, 0, None, None] - columns, xy[:, :, 1, None, None] - rows[:, None])  # (B, K, h, w)
-    buried = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL / 2)).any(1)
+    buried = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL_PX / 2)).any(1)
     asked = ~buried | (mass[:, 0] > 0)
     nearest, which = distance.masked_fill(~wanted[..., None, None], float("inf")).min(1)
-    near = nearest <= CELL
+    near = nearest <= CELL_PX
     identity = patch.long().gather(1, which.flatten(1)).view_as(which)
-    return Targets(target, asked.float(), torch.where(near, identity, ids), near, (nearest > 2 * CELL) & ~buried)
+    return Targets(target, asked.float(), torch.where(near, identity, ids), near, (nearest > 2 * CELL_PX) & ~buried)
 
 
-def losses(detector: Tensor, ids: Tensor, targets: Targets, config: Loss) -> tuple[Tensor, Tensor]:
+def losses(detector: Tensor, ids: Tensor, targets: Targets, config: LossConfig) -> tuple[Tensor, Tensor]:
     """(detector loss, identity loss) of raw head outputs (B, 65, h, w) and (B, ids + 1, h, w)."""
     log_p = F.log_softmax(detector.float(), 1)
     entropy = -(targets.place * log_p).sum(1)
@@ -75,13 +75,13 @@ def losses(detector: Tensor, ids: Tensor, targets: Targets, config: Loss) -> tup
     return located, hinge(ids.float(), targets, config)
 
 
-def _cross_entropy(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+def _cross_entropy(ids: Tensor, targets: Targets, config: LossConfig) -> Tensor:
     entropy = F.cross_entropy(ids, targets.identity, reduction="none")
     near, far = targets.near, targets.far
     return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
 
 
-def _hinge(ids: Tensor, targets: Targets, config: Loss) -> Tensor:
+def _hinge(ids: Tensor, targets: Targets, config: LossConfig) -> Tensor:
     """SuperPoint's descriptor loss (its eq. 4-6) of one image against the map of one-hot vectors.
 
     The sum over pairs of cells is grouped by the class of the second cell: the dot product with a

@@ -1,12 +1,12 @@
-"""The network and its losses: SuperPoint with an attached layer on each head (paper §2.2), widths as data.
+"""The network: SuperPoint with an attached layer on each head (paper §2.2); its sizes are data.
 
-A VGG encoder brings the image to cells of 8x8 pixels. The detector head gives 65 logits a cell: one a
-pixel of the cell, in row order, and one for "no keypoint". The descriptor head, 256 wide, ends in an
-attached layer of five ID logits: four patches and "no patch". ``forward`` ends there; what turns logits
-into keypoints is :func:`kpbench.detectors.superpoint.decode`, outside the exported graph.
+A VGG encoder reduces the image to cells of 8x8 px. The detector head gives 65 logits per cell: one per pixel of the
+cell, row by row, and one for "no keypoint". The descriptor head ends in an attached layer with one logit per design
+and one for "no patch". ``forward`` returns logits; :func:`kpbench.detectors.decode` turns them into keypoints outside
+of the exported graph.
 
-The parts bear the names of the MIT re-implementation (rpautrat/SuperPoint, ``superpoint_pytorch.py``),
-so that its published weights fit: ``backbone.<stage>.<n>.conv|bn``, ``detector.<n>``, ``descriptor.<n>``.
+The parts have the names of the MIT re-implementation (rpautrat/SuperPoint, ``superpoint_pytorch.py``), so that its
+published weights can be loaded: ``backbone.<stage>.<n>.conv|bn``, ``detector.<n>``, ``descriptor.<n>``.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from kpbench.detectors.superpoint import CELL_PX
 from kpbench.training.recipe import NetworkConfig
 
-CELL = 8
-"""Side of a cell, px: three stages of the encoder halve the image."""
-
+HALVINGS = 3
+"""Stages of the encoder that halve the image: a cell is ``2**HALVINGS`` px wide."""
 NO_KEYPOINT_PRIOR = 0.98
-"""Probability of "no keypoint" and "no patch" that an untrained network starts from."""
+"""Probability of "no keypoint" and of "no patch" that an untrained network gives."""
 
 
-def block(c_in: int, c_out: int, kernel: int, norm: str, stride: int = 1, relu: bool = True) -> nn.Sequential:
-    """Convolution, BatchNorm and ReLU, in the order that ``norm`` names."""
+def conv_block(c_in: int, c_out: int, kernel: int, norm: str, stride: int = 1, relu: bool = True) -> nn.Sequential:
+    """Return a convolution with BatchNorm "before" or "after" the ReLU; ``relu=False`` leaves the ReLU out."""
     conv = nn.Conv2d(c_in, c_out, kernel, stride, padding=kernel // 2)
     bn, activation = nn.BatchNorm2d(c_out, eps=1e-3), nn.ReLU(inplace=True) if relu else nn.Identity()
     parts = [("bn", bn), ("activation", activation)] if norm == "before" else [("activation", activation), ("bn", bn)]
@@ -36,10 +36,21 @@ def block(c_in: int, c_out: int, kernel: int, norm: str, stride: int = 1, relu: 
 
 
 class SuperPoint(nn.Module):
-    """Grey images to raw head outputs.
+    """SuperPoint with an attached layer on each head.
 
-    ``forward`` takes (B, 1, H, W) in [0, 1], H and W multiples of 8, and returns the detector logits
-    (B, 65, H/8, W/8) and the ID logits (B, ids + 1, H/8, W/8).
+    Parameters
+    ----------
+    config : NetworkConfig
+        Sizes of the layers.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from kpbench.training import NetworkConfig, SuperPoint
+    >>> network = SuperPoint(NetworkConfig(widths=(4, 4, 8, 8), head_width=8, descriptor_width=8)).eval()
+    >>> detector, identity = network(torch.zeros(1, 1, 32, 48))
+    >>> detector.shape, identity.shape
+    (torch.Size([1, 65, 4, 6]), torch.Size([1, 5, 4, 6]))
     """
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -48,36 +59,36 @@ class SuperPoint(nn.Module):
         stages: list[nn.Module] = []
         before = 1
         for n, (width, depth) in enumerate(zip(config.widths, config.depths, strict=True)):
-            halves = n < 3
+            halves = n < HALVINGS
             layers: list[nn.Module] = []
             for k in range(depth):
                 stride = 2 if halves and config.down == "stride" and k == depth - 1 else 1
-                layers.append(block(before, width, 3, config.norm, stride))
+                layers.append(conv_block(before, width, 3, config.norm, stride))
                 before = width
             if halves and config.down == "max":
                 layers.append(nn.MaxPool2d(2, 2))
             stages.append(nn.Sequential(*layers))
         self.backbone = nn.Sequential(*stages)
-        cells = CELL * CELL + 1
-        self.detector = self._head(before, cells)
+        places = CELL_PX * CELL_PX + 1
+        self.detector = self._head(before, places)
         self.descriptor = self._head(before, config.descriptor_width)
-        self.detector_attached = nn.Conv2d(cells, cells, 1)
+        self.detector_attached = nn.Conv2d(places, places, 1)
         self.descriptor_attached = nn.Conv2d(config.descriptor_width, config.ids + 1, 1)
-        self._start()
+        self._initialise()
 
     def _head(self, c_in: int, c_out: int) -> nn.Sequential:
         width, norm = self.config.head_width, self.config.norm
-        return nn.Sequential(block(c_in, width, 3, norm), block(width, c_out, 1, norm, relu=False))
+        return nn.Sequential(conv_block(c_in, width, 3, norm), conv_block(width, c_out, 1, norm, relu=False))
 
-    def _start(self) -> None:
-        """Kaiming weights; final biases at the prior, without which training from scratch does not start."""
+    def _initialise(self) -> None:
+        """Set Kaiming weights, and biases at the prior; without it, training from scratch does not start."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(cast(Tensor, module.bias))
-        pixels, ids = CELL * CELL, self.config.ids
+        pixels, ids = CELL_PX * CELL_PX, self.config.ids
         with torch.no_grad():
-            # the attached layer starts as "pass on what the detector head says"
+            # the attached layer starts as the identity
             self.detector_attached.weight.copy_(torch.eye(pixels + 1)[:, :, None, None])
             cast(Tensor, self.detector_attached.bias)[-1] = math.log(
                 NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * pixels
@@ -93,9 +104,17 @@ class SuperPoint(nn.Module):
         return [*self.detector_attached.parameters(), *self.descriptor_attached.parameters()]
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Raw heads, see the class."""
+        """Return the logits of the two heads.
+
+        Parameters
+        ----------
+        image : Tensor of shape (B, 1, H, W)
+            Grey images in [0, 1]; H and W are multiples of 8.
+
+        Returns
+        -------
+        detector : Tensor of shape (B, 65, H/8, W/8)
+        identity : Tensor of shape (B, ids + 1, H/8, W/8)
+        """
         features = self.backbone(image)
         return self.detector_attached(self.detector(features)), self.descriptor_attached(self.descriptor(features))
-
-
-# Losses -----------------------------------------------------------------------------------------------

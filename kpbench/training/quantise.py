@@ -19,7 +19,7 @@ from kpbench.files import write_atomic
 from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
-from kpbench.training.export import Exported, _difference
+from kpbench.training.export import Exported, largest_difference
 
 
 def export_int8(model: str | Path, out: str | Path) -> Exported:
@@ -36,7 +36,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     Raises
     ------
     DataError
-        If the file cannot be read, was not written by :func:`export`, or is in integers already.
+        If the file cannot be read, was not written by :func:`export_onnx`, or is in integers already.
     """
     import onnx
 
@@ -59,7 +59,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     onnx.helper.set_model_props(quantised, {"kpbench": json.dumps(content, sort_keys=True)})
     written = cast(bytes, quantised.SerializeToString())
     image = np.random.default_rng(0).random((1, 1, 72, 104), np.float32)
-    difference = _difference(written, image, list(open_session(data)[0].run(None, {"image": image})))
+    difference = largest_difference(written, image, list(open_session(data)[0].run(None, {"image": image})))
     write_atomic(Path(out), written)
     return Exported(len(written), content["step"], difference)
 

@@ -1,4 +1,4 @@
-"""Training recipes: TOML in, frozen :class:`Recipe` out. Known without torch."""
+"""Training recipes: TOML files, read into a frozen :class:`Recipe`. This module does not need torch."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
+from kpbench.files import shipped_folder
 from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.training.batches import SampleConfig
 
@@ -22,17 +23,23 @@ class NetworkConfig:
     widths : tuple of 4 int
         Channels of the encoder's stages, at strides 1, 2, 4 and 8.
     depths : tuple of 4 int
-        3x3 convolutions in each stage.
+        Number of 3x3 convolutions in each stage.
     down : str
-        What halves the image after each of the first three stages: "max" (max-pooling) or "stride"
-        (the stage's last convolution has stride 2).
+        How each of the first three stages halves the image: "max" (max-pooling after the stage) or "stride" (the
+        last convolution of the stage has stride 2).
     head_width, descriptor_width : int
         Channels of the hidden layer of each head, and of the descriptor.
     norm : str
-        BatchNorm "before" the activation (folds into the convolution at export) or "after" it (as in the
-        published SuperPoint weights, which need that).
+        Position of BatchNorm: "before" the activation (then it is folded into the convolution at export) or "after"
+        it (as in the published SuperPoint weights).
     ids : int
-        Number of patches that the ID head tells apart, besides "no patch".
+        Number of designs that the ID head tells apart, besides "no patch".
+
+    Examples
+    --------
+    >>> from kpbench.training import NetworkConfig
+    >>> NetworkConfig(head_width=128).widths
+    (64, 64, 128, 128)
     """
 
     widths: tuple[int, int, int, int] = (64, 64, 128, 128)
@@ -55,26 +62,26 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
-class Loss:
-    """What is minimised: detector + ``identity_weight`` · identity.
+class LossConfig:
+    """The loss that is minimised: detector + ``identity_weight`` · identity.
 
     Attributes
     ----------
     place : str
-        Where in its cells a keypoint is asked for: "pixel" (the nearest one, as SuperPoint) or "split"
-        (shared out to the four around it by distance, across cell borders, so that the mean of the
-        distribution is the keypoint).
+        Target of the detector head: "pixel" (the pixel nearest to the keypoint, as SuperPoint) or "split" (the four
+        pixels around it, by distance and across cell borders, so that the mean of the target is the keypoint).
     positive_weight : float
-        Weight of a cell that holds a keypoint, relative to one that holds none.
+        Weight of a cell with a keypoint, relative to a cell without.
     focal : float
-        Exponent of the focal loss (Lin et al., ICCV 2017) on "is there a keypoint in this cell"; 0: none.
+        Exponent of the focal loss on "is there a keypoint in this cell" (Lin et al., *Focal loss for dense object
+        detection*, ICCV 2017); 0: none.
     identity : str
-        "entropy": cross-entropy over patches and "no patch" at cells within 8 px of a keypoint and beyond
-        16 px of all; "hinge": SuperPoint's descriptor loss against the one-hot map of every cell, where
-        cells of one class are no negatives of each other.
+        "entropy": cross-entropy over designs and "no patch", at cells within 8 px of a keypoint and beyond 16 px of
+        all. "hinge": SuperPoint's descriptor loss against the one-hot map of all cells; cells of one class are not
+        negatives of each other.
     identity_weight : float
     lambda_d, positive_margin, negative_margin : float
-        Of the hinge loss (Table 1).
+        Parameters of the hinge loss (the paper's Table 1).
     """
 
     place: str = "split"
@@ -89,29 +96,75 @@ class Loss:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the training: how many samples, which weights learn, how strong degradations grow."""
+    """A stretch of the training.
+
+    Attributes
+    ----------
+    samples : int
+    trains : str
+        Weights that are trained: "all", or "attached" (only the attached layers).
+    severity : (float, float)
+        Severity of the degradations at its first and its last sample: 0 is clean, 1 is the full range.
+
+    Examples
+    --------
+    >>> from kpbench.training import Phase
+    >>> Phase(1000, severity=(0.0, 1.0)).trains
+    'all'
+    """
 
     samples: int
-    trains: str = "all"  # or "attached"
+    trains: str = "all"
     severity: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """All that a training is a function of, besides photographs, designs and initial weights.
+    """A training, but for its photographs, designs and initial weights.
 
     Attributes
     ----------
     name : str
     phases : tuple of Phase
-    batch : samples a step, over all processes.
-    optimizer : "adam" (weight decay as L2, as in the paper) or "adamw".
+    seed : int
+    network : NetworkConfig
+    samples : SampleConfig
+    loss : LossConfig
+    batch : int
+        Samples per step, over all processes.
+    optimizer : str
+        "adam" (weight decay as L2, as in the paper) or "adamw".
     lr, weight_decay : float
-    warmup : samples over which the learning rate rises from 0.
-    schedule : "step" (times ``decay`` at each of ``decay_at``) or "cosine" (down to ``decay`` at the end).
-    ema : decay of the running mean of the weights a step; the mean is what is evaluated and exported.
-    precision : "fp32", or "bf16" (autocast): twice as fast on a GPU or a CPU with AMX, a tenth of the speed on others.
-    compile : whether to use ``torch.compile``.
+        ``lr`` is the learning rate.
+    warmup : int
+        Samples over which the learning rate rises from 0.
+    schedule : str
+        "step" (the learning rate is multiplied by ``decay`` at each of ``decay_at``) or "cosine" (it falls to
+        ``decay`` times its value at the end).
+    decay : float
+    decay_at : tuple of int
+        Samples.
+    ema : float
+        Decay per step of the running mean of the weights; the mean is validated and exported.
+    precision : str
+        "fp32", or "bf16" (autocast): twice as fast on a GPU or a processor with AMX or AVX512-BF16, far slower on
+        other processors.
+    compile : bool
+        Whether ``torch.compile`` is used.
+
+    Raises
+    ------
+    DataError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> from kpbench.training import load_recipe
+    >>> recipe = load_recipe("paper")
+    >>> [phase.samples for phase in recipe.phases]
+    [300000, 300000, 2400000]
+    >>> recipe.rate(0), recipe.steps
+    (0.0005, 375000)
     """
 
     name: str
@@ -119,7 +172,7 @@ class Recipe:
     seed: int = 0
     network: NetworkConfig = field(default_factory=NetworkConfig)
     samples: SampleConfig = field(default_factory=SampleConfig)
-    loss: Loss = field(default_factory=Loss)
+    loss: LossConfig = field(default_factory=LossConfig)
     batch: int = 64
     optimizer: str = "adamw"
     lr: float = 1e-3
@@ -140,11 +193,11 @@ class Recipe:
 
     @property
     def steps(self) -> int:
-        """Steps of the optimizer from start to end."""
+        """Number of steps of the optimizer."""
         return sum(p.samples for p in self.phases) // self.batch
 
     def phase(self, step: int) -> tuple[Phase, float]:
-        """The phase at a step, and the severity of degradations there."""
+        """Return the phase at a step, and the severity of degradations there."""
         at = step * self.batch
         for phase in self.phases[:-1]:
             if at < phase.samples:
@@ -156,7 +209,7 @@ class Recipe:
         return phase, low + (high - low) * min(at / phase.samples, 1.0)
 
     def rate(self, step: int) -> float:
-        """The learning rate at a step."""
+        """Return the learning rate at a step."""
         at = step * self.batch
         warm = min((at + self.batch) / self.warmup, 1.0) if self.warmup else 1.0
         if self.schedule == "step":
@@ -166,7 +219,7 @@ class Recipe:
 
 
 T = TypeVar("T")
-CHOICES = {
+CHOICES = {  # values of the keys that have a few possible values
     "place": ("pixel", "split"),
     "identity": ("entropy", "hinge"),
     "trains": ("all", "attached"),
@@ -177,14 +230,29 @@ CHOICES = {
 }
 
 
-def load_recipe(path: str | Path) -> Recipe:
-    """Read a training recipe.
+def shipped_recipes() -> dict[str, Path]:
+    """Return the files of the recipes that ship with kpbench, by name."""
+    return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.toml"))}
+
+
+def load_recipe(name: str | Path) -> Recipe:
+    """Read a training recipe: one that ships with kpbench by its name, or a TOML file.
 
     Raises
     ------
     DataError
-        If the file cannot be read, is no TOML, or has an unknown key or a value of the wrong kind.
+        If there is no such recipe, the file cannot be read or is no TOML, or it has an unknown key or a wrong value.
+
+    Examples
+    --------
+    >>> from kpbench.training import load_recipe
+    >>> load_recipe("reference").name
+    'superpoint-small'
     """
+    shipped = shipped_recipes()
+    path = shipped.get(str(name), Path(name))
+    if str(name) not in shipped and path.suffix != ".toml":
+        raise DataError(f"there is no recipe {str(name)!r}, only: {', '.join(shipped)}, or a .toml file of your own")
     return parse_recipe(read_toml(path, DataError), str(path))
 
 

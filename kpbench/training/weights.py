@@ -65,7 +65,7 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
     ------
     DataError
         If a tensor has no place in the network or another shape, or a part of the network but the
-        attached layers gets none. Weights without any BatchNorm are complete, see :func:`unfold`.
+        attached layers gets none. Weights without any BatchNorm are complete, see :func:`restore_batchnorm`.
     """
     own = network.state_dict()
     bare = is_folded(weights)
@@ -91,7 +91,7 @@ def is_folded(weights: dict[str, Tensor]) -> bool:
     return not any(".bn." in name for name in weights)
 
 
-def unfold(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
+def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
     """Let each BatchNorm pass on what it gets, as its statistics stand on these inputs of the network.
 
     The contrary of folding: the network computes what its convolutions alone would, and can be trained on.
@@ -129,7 +129,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
     network : SuperPoint
         Changed in place.
     smaller : SuperPoint
-        Its BatchNorm in place, see :func:`unfold`.
+        Its BatchNorm in place, see :func:`restore_batchnorm`.
     images : Tensor of shape (B, 1, H, W) in [0, 1]
         On which the BatchNorm of convolutions that pass on stands.
     source : str
@@ -163,7 +163,7 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
         heard = width
         for name in (f"{head}.0", f"{head}.1", f"{head}_attached"):
             heard = _take(network.get_submodule(name), smaller.get_submodule(name), heard, f"{source}: {name}")
-    unfold(network, [images], passing)
+    restore_batchnorm(network, [images], passing)
     return f"taken into another network, convolutions that pass on: {len(passing)}, left out: {left_out}"
 
 

@@ -3,7 +3,7 @@ import re
 import numpy as np
 import pytest
 
-from kpbench.detectors import prediction as pipeline
+from kpbench.detectors import prediction
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.suppression import suppress
 from kpbench.errors import DataError
@@ -122,6 +122,6 @@ def test_a_detector_that_exits_fails_on_its_image():
     def leave(image):
         raise SystemExit(3)
 
-    found, said = pipeline._detect(LoadedDetector("leaver", "1", leave), np.zeros((8, 8), np.uint8), None)
+    found, message = prediction._detect(LoadedDetector("leaver", "1", leave), np.zeros((8, 8), np.uint8), None)
     assert len(found) == 0
-    assert "SystemExit" in said
+    assert "SystemExit" in message

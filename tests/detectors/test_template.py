@@ -6,9 +6,9 @@ import pytest
 from kpbench.degrade.blurs import blur, motion_blur
 from kpbench.degrade.effects import dimming, noise
 from kpbench.detectors.interface import load_detector
-from kpbench.detectors.template import TemplateDetector, crossings
+from kpbench.detectors.template import TemplateDetector, find_crossings
 from kpbench.errors import DataError
-from kpbench.fitting.pyramid import pyramid, sample
+from kpbench.fitting.pyramid import build_pyramid, sample_pyramid
 from kpbench.patches.design import Patch, SemiCircle, parse_patch, shipped_patches
 from kpbench.render.background import procedural_background
 from kpbench.render.placement import Placement
@@ -139,7 +139,7 @@ def test_a_design_of_one_edge_is_refused():
 def test_edges_cross_where_the_centre_is(patch):
     H = np.array([[9.0, 2.0, 30.2], [-2.0, 8.0, 29.9], [0, 0, 1]])
     image = render_scene(np.full((60, 60), 120, np.uint8), [Placement(patch, H, 30, 220)]).image
-    xy, strength = crossings(image.astype(np.float32))
+    xy, strength = find_crossings(image.astype(np.float32))
     assert np.hypot(*(xy - H[:2, 2]).T).min() < 1.5
     assert (np.diff(strength) <= 0).all()
 
@@ -150,9 +150,9 @@ def test_the_designs_are_not_written_into_the_code():
 
 
 def test_more_poses_than_remap_takes_at_once_are_sampled():
-    levels = pyramid(procedural_background(np.random.default_rng(0), 64, 48), 0)
+    levels = build_pyramid(procedural_background(np.random.default_rng(0), 64, 48), 0)
     xy, A = np.tile([[20.0, 15.0]], (40_000, 1)), np.tile(np.eye(2), (40_000, 1, 1))
-    values = sample(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
+    values = sample_pyramid(levels, np.zeros(40_000, int), xy, A, np.array([[0.0, 0.0], [1.0, 2.0]]))
     assert (values == [levels[0][15, 20], levels[0][17, 21]]).all()
 
 

@@ -10,7 +10,7 @@ import torch
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
-from kpbench.training.export import export, fold, to_onnx
+from kpbench.training.export import export_onnx, fold, to_onnx
 from kpbench.training.loop import train
 from kpbench.training.network import SuperPoint
 from kpbench.training.quantise import export_int8
@@ -62,7 +62,7 @@ def run(tmp_path_factory):
     (folder / "photos").mkdir()
     cv2.imwrite(str(folder / "photos" / "a.png"), np.full((64, 64), 99, np.uint8))
     assert train(recipe, folder, folder / "photos", workers=0, validation_images=1)
-    return folder, export(folder / "checkpoint.safetensors", folder / "tiny.onnx")
+    return folder, export_onnx(folder / "checkpoint.safetensors", folder / "tiny.onnx")
 
 
 def test_export_writes_the_mean_weights_and_says_what_they_are(run):
@@ -106,5 +106,5 @@ def test_eight_bits_come_from_an_exported_file_and_lead_nowhere(run, tmp_path):
 def test_a_file_that_is_no_checkpoint_is_one_line(tmp_path):
     (tmp_path / "x.safetensors").write_bytes(b"nothing")
     with pytest.raises(DataError, match=r"x\.safetensors: cannot be read as a checkpoint") as caught:
-        export(tmp_path / "x.safetensors", tmp_path / "x.onnx")
+        export_onnx(tmp_path / "x.safetensors", tmp_path / "x.onnx")
     assert "\n" not in str(caught.value)

@@ -19,8 +19,8 @@ from kpbench.patches.design import shipped_patches
 from kpbench.training import loop as training
 from kpbench.training.batches import Batch, SampleConfig
 from kpbench.training.checkpoint import network_of, read_checkpoint
-from kpbench.training.export import export
-from kpbench.training.recipe import Loss, NetworkConfig, Phase, Recipe, load_recipe
+from kpbench.training.export import export_onnx
+from kpbench.training.recipe import LossConfig, NetworkConfig, Phase, Recipe, load_recipe
 from kpbench.training.weights import initial_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -127,7 +127,7 @@ def test_a_checkpoint_is_trained_on_grown_and_for_other_designs_without_its_id_h
 def test_an_exported_file_whose_batchnorm_is_lost_is_refused(tmp_path, run):
     after = replace(RECIPE, network=replace(TINY, norm="after"))
     run(after, tmp_path)
-    export(tmp_path / "checkpoint.safetensors", tmp_path / "a.onnx")
+    export_onnx(tmp_path / "checkpoint.safetensors", tmp_path / "a.onnx")
     with pytest.raises(DataError, match=r"a\.onnx: its BatchNorm, .* cannot be put back; start from its checkpoint"):
         initial_weights(tmp_path / "a.onnx", shipped_patches())
 
@@ -188,7 +188,7 @@ def test_the_papers_recipe_is_the_papers():
     assert recipe.samples == SampleConfig("scenes", (640, 480), epoch)
     assert (recipe.optimizer, recipe.lr, recipe.weight_decay) == ("adam", 5e-4, 1e-6)
     assert (recipe.schedule, recipe.decay, recipe.decay_at) == ("step", 0.2, (15 * epoch, 45 * epoch))
-    assert recipe.loss == Loss("pixel", 1.0, 0.0, "hinge", 0.2, 640 * 480 / 5, 0.9, 0.2)
+    assert recipe.loss == LossConfig("pixel", 1.0, 0.0, "hinge", 0.2, 640 * 480 / 5, 0.9, 0.2)
     assert recipe.network == NetworkConfig(norm="after")
 
 

@@ -9,7 +9,7 @@ from safetensors.torch import save_file
 from kpbench.errors import DataError
 from kpbench.training.losses import losses, make_targets
 from kpbench.training.network import SuperPoint
-from kpbench.training.recipe import Loss, NetworkConfig
+from kpbench.training.recipe import LossConfig, NetworkConfig
 from kpbench.training.weights import grow, initialise, read_weights
 
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), head_width=8, descriptor_width=8)
@@ -213,7 +213,7 @@ def test_ignored_keypoints_ask_for_nothing_around_them():
 
 @pytest.mark.parametrize("identity", ["entropy", "hinge"])
 def test_perfect_heads_lose_nothing_and_wrong_ones_do(identity):
-    config = Loss(place="pixel", identity=identity)
+    config = LossConfig(place="pixel", identity=identity)
     targets = make_targets(one_keypoint(20.0, 20.0), 64, 64, 4, "pixel")
     detector = 50 * targets.place
     ids = 50 * torch.nn.functional.one_hot(targets.identity, 5).permute(0, 3, 1, 2).float()
@@ -231,7 +231,7 @@ def test_perfect_heads_lose_nothing_and_wrong_ones_do(identity):
 def test_hinge_equals_the_sum_over_pairs_of_cells():
     """SuperPoint's loss written out pair by pair, as in its paper."""
     torch.manual_seed(0)
-    config = Loss(identity="hinge", lambda_d=250.0, positive_margin=0.9, negative_margin=0.2)
+    config = LossConfig(identity="hinge", lambda_d=250.0, positive_margin=0.9, negative_margin=0.2)
     targets = make_targets(one_keypoint(20.0, 20.0), 32, 40, 4, "pixel")
     ids = torch.randn(1, 5, 4, 5)
     classes = np.full(20, 4)
@@ -253,5 +253,5 @@ def test_focal_weight_spares_what_is_already_right():
     targets = make_targets(one_keypoint(20.0, 20.0), 64, 64, 4, "pixel")
     ids = torch.zeros(1, 5, 8, 8)
     right = 6 * targets.place
-    plain, focal = (losses(right, ids, targets, Loss(focal=f))[0] for f in (0.0, 2.0))
+    plain, focal = (losses(right, ids, targets, LossConfig(focal=f))[0] for f in (0.0, 2.0))
     assert focal < 0.2 * plain

@@ -11,7 +11,7 @@ from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 if TYPE_CHECKING:
     from kpbench.detectors.interface import LoadedDetector
-    from kpbench.detectors.prediction import Predicted
+    from kpbench.detectors.prediction import PredictionRun
 
 
 @click.command()
@@ -85,7 +85,7 @@ def detect(
 
 def _run(
     source: str, detector: str | LoadedDetector, threshold: float | None, overlay: Path | None, workers: int | None
-) -> Predicted:
+) -> PredictionRun:
     """A detector, by name unless it was told its designs, over a dataset or over images."""
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.folder import open_dataset

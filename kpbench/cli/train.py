@@ -1,0 +1,221 @@
+"""``kpbench train`` and ``kpbench export-model``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import click
+
+from kpbench.cli.options import BACKGROUNDS, PATCHES
+
+EPOCHS = {"ellipse": 6, "judges": 10}
+"""Default of --epochs, per choice of --verifier."""
+VERIFIER_ONLY = {"datasets", "test", "epochs", "detector"}
+"""Parameters that are for --verifier alone."""
+SHARED = {"verifier", "out", "init", "workers", "threads"}
+"""Parameters that are for both kinds of training."""
+
+
+@contextmanager
+def _needs_torch(command: str) -> Iterator[None]:
+    """Turn an import error into the command that installs what is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        message = f"kpbench {command} needs PyTorch: pip install 'kpbench[train]' ({error})"
+        raise click.ClickException(message) from None
+
+
+@click.command()
+@click.argument("datasets", nargs=-1, type=click.Path(path_type=Path), metavar="[DATASET]...")
+@click.option("--config", help="Recipe: the name of a shipped one, such as reference, or a TOML file.")
+@click.option(
+    "--verifier",
+    type=click.Choice(list(EPOCHS)),
+    help="Train networks of the verification, on DATASETs, instead of the detector's network.",
+)
+@click.option("--test", type=click.Path(path_type=Path), help="With --verifier: dataset that the report is about.")
+@click.option(
+    "--epochs",
+    type=click.IntRange(min=0),
+    help="With --verifier: passes over the datasets; 0 trains nothing. Default: 6 for ellipse, 10 for judges.",
+)
+@click.option(
+    "--detector",
+    type=click.Path(path_type=Path),
+    metavar="FILE.onnx",
+    help="With --verifier judges: weights whose candidates are judged. Default: superpoint-small.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="Folder of the run. Default: runs/NAME of the recipe; runs/ellipse or runs/judges.",
+)
+@BACKGROUNDS
+@PATCHES
+@click.option(
+    "--init",
+    help="Weights to start from: superpoint or superpoint-small (those that ship), an exported .onnx, a checkpoint, "
+    "or SuperPoint's (.pth, .safetensors); with --verifier: shipped. Default: random weights.",
+)
+@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; --init is not used.")
+@click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
+@click.option(
+    "--workers",
+    type=click.IntRange(min=0),
+    help="Number of processes that make samples. Default: 1; with --verifier one per core.",
+)
+@click.option("--threads", type=click.IntRange(min=1), help="Threads of PyTorch. Default: as PyTorch chooses.")
+@click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard too.")
+@click.pass_context
+def train(
+    ctx: click.Context,
+    datasets: tuple[Path, ...],
+    config: str | None,
+    verifier: str | None,
+    test: Path | None,
+    epochs: int | None,
+    detector: Path | None,
+    out: Path | None,
+    backgrounds: Path | None,
+    patches: tuple[Path, ...],
+    init: str | None,
+    resume: bool,
+    minutes: float | None,
+    workers: int | None,
+    threads: int | None,
+    tensorboard: bool,
+) -> None:
+    """Train the detector's network by a recipe, or the networks that verify its candidates.
+
+    The detector is trained on samples that are made on the fly; an interrupted run can be resumed to the bit. The
+    verifier is trained on synthetic DATASETs; it writes ellipse.onnx, or first-judge.onnx and second-judge.onnx.
+
+    \b
+    Examples:
+      kpbench train --config reference --backgrounds photos/ --minutes 30
+      kpbench train --config reference --backgrounds photos/ --resume
+      torchrun --nproc-per-node 4 -m kpbench train --config reference --workers 4
+      kpbench train --verifier ellipse set-1 set-2 --test set-3
+      kpbench train --verifier judges set-1 set-2 --test set-3 --init shipped
+    """
+    given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
+    if verifier is None:
+        if misplaced := given & VERIFIER_ONLY:
+            raise click.UsageError(f"{_spell(misplaced)} only with --verifier")
+        if config is None:
+            raise click.UsageError("one of --config and --verifier is missing")
+        _train_detector(config, out, backgrounds, patches, init, resume, minutes, workers, threads, tensorboard)
+        return
+    if misplaced := given - VERIFIER_ONLY - SHARED:
+        raise click.UsageError(f"{_spell(misplaced)} not with --verifier")
+    if not datasets or test is None:
+        raise click.UsageError("--verifier needs at least one DATASET, and --test DATASET")
+    if init not in (None, "shipped"):
+        raise click.UsageError(f"--init is {init!r}, expected shipped with --verifier")
+    if detector is not None and verifier == "ellipse":
+        raise click.UsageError("--detector only with --verifier judges")
+    _train_verifier(verifier, datasets, test, epochs, detector, out, init is not None, workers, threads)
+
+
+def _spell(parameters: set[str]) -> str:
+    """Return parameters of the command as a user types them."""
+    return ", ".join("DATASET" if name == "datasets" else f"--{name}" for name in sorted(parameters))
+
+
+def _train_detector(
+    config: str,
+    out: Path | None,
+    backgrounds: Path | None,
+    patches: tuple[Path, ...],
+    init: str | None,
+    resume: bool,
+    minutes: float | None,
+    workers: int | None,
+    threads: int | None,
+    tensorboard: bool,
+) -> None:
+    from kpbench.patches.design import load_patches, shipped_patches
+    from kpbench.training.recipe import load_recipe
+
+    recipe = load_recipe(config)
+    with _needs_torch("train"):
+        from kpbench.training import loop as training
+    folder = out or Path("runs") / recipe.name
+    finished = training.train(
+        recipe,
+        folder,
+        backgrounds,
+        init=init,
+        resume_run=resume,
+        minutes=minutes,
+        workers=1 if workers is None else workers,
+        threads=threads,
+        tensorboard=tensorboard,
+        patches=load_patches(patches) if patches else shipped_patches(),
+        say=lambda line: click.echo(line, err=True),
+    )
+    click.echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
+
+
+def _train_verifier(
+    verifier: str,
+    datasets: tuple[Path, ...],
+    test: Path,
+    epochs: int | None,
+    detector: Path | None,
+    out: Path | None,
+    from_shipped: bool,
+    workers: int | None,
+    threads: int | None,
+) -> None:
+    from kpbench.dataset.folder import open_dataset
+    from kpbench.workers import count_cores
+
+    with _needs_torch("train"):
+        from kpbench.training.verifier.ellipse import train_ellipse
+        from kpbench.training.verifier.judges import train_judges
+    train_it = train_ellipse if verifier == "ellipse" else partial(train_judges, detector=detector)
+    train_it(
+        [open_dataset(dataset) for dataset in datasets],
+        open_dataset(test),
+        out or Path("runs") / verifier,
+        epochs=EPOCHS[verifier] if epochs is None else epochs,
+        from_shipped=from_shipped,
+        workers=count_cores() if workers is None else workers,
+        threads=threads,
+        say=click.echo,
+    )
+
+
+@click.command("export-model")
+@click.argument("checkpoint", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="ONNX file to write.")
+@click.option("--int8", is_flag=True, help="Write an exported ONNX file again in 8-bit integers, for processors.")
+def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
+    """Write the trained network as one ONNX file, and check it against PyTorch.
+
+    With --int8 CHECKPOINT is such an ONNX file.
+
+    \b
+    Examples:
+      kpbench export-model runs/superpoint-small/checkpoint.safetensors --out superpoint-small.onnx
+      kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
+    """
+    from kpbench.errors import DataError
+    from kpbench.files import refuse_overwrite
+
+    with _needs_torch("export-model"):
+        from kpbench.training.export import export_onnx
+        from kpbench.training.quantise import export_int8
+    if out.suffix != ".onnx":
+        raise DataError(f"{out}: expected a name ending in .onnx")
+    if int8 != (checkpoint.suffix == ".onnx"):
+        problem = "--int8 takes the .onnx file of export-model, not a checkpoint" if int8 else "is exported already"
+        raise DataError(f"{checkpoint}: {problem}; export-model makes CHECKPOINT to .onnx, and --int8 that to integers")
+    refuse_overwrite([out], [checkpoint])
+    done, other = (export_int8(checkpoint, out), "float32") if int8 else (export_onnx(checkpoint, out), "PyTorch")
+    click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {other} by at most {done.difference:.1e}")

@@ -1,0 +1,18 @@
+from .interface import DETECTORS as DETECTORS
+from .interface import Detector as Detector
+from .interface import LoadedDetector as LoadedDetector
+from .interface import load_detector as load_detector
+from .prediction import PredictionRun as PredictionRun
+from .prediction import predict as predict
+from .prediction import predict_images as predict_images
+from .superpoint import Decoding as Decoding
+from .superpoint import SmallSuperPointDetector as SmallSuperPointDetector
+from .superpoint import SuperPointDetector as SuperPointDetector
+from .superpoint import decode as decode
+from .superpoint import keypoint_probability as keypoint_probability
+from .suppression import suppress as suppress
+from .template import TemplateDetector as TemplateDetector
+from .verification import VerifiedCandidates as VerifiedCandidates
+from .verification import verify_candidates as verify_candidates
+
+__all__: list[str]

@@ -1,0 +1,156 @@
+"""Hypotheses of the verification: places with a design, a pose, and the evidence for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.detectors.suppression import suppress
+from kpbench.fitting.align import short_semi_axis
+from kpbench.fitting.templates import VIEW_PX, build_templates
+from kpbench.fitting.views import blur_views
+from kpbench.patches.design import Patch
+from kpbench.types import Float, Float32, Int
+
+MERGE_DISTANCE = 0.2
+"""Short semi-axes. Of two hypotheses of one design whose centres are nearer than this, the likelier one is kept."""
+
+
+class Evidence(IntEnum):
+    """Columns of the evidence that a judge sees.
+
+    The first judge sees the columns up to ``RADIUS``; the second judge, after the fit, sees all. Logs are natural;
+    distances are in short semi-axes.
+    """
+
+    NETWORK_SCORE = 0
+    """Log odds of the network's score."""
+    ID_PATCH = 1
+    """Log probability that the ID head sees a patch."""
+    ID_DESIGN = 2
+    """Log probability of the design by the ID head."""
+    ELLIPSE = 3
+    """Log odds that the place lies on a patch, by the ellipse network."""
+    NCC = 4
+    """-log(1.01 - correlation of the whole design)."""
+    SHIFT = 5
+    """Log of the distance from the network's place."""
+    CONTRAST = 6
+    """Log of the half contrast over the range of the image."""
+    CONTRAST_TO_NOISE = 7
+    """Log of the half contrast over the noise."""
+    RADIUS = 8
+    """Log of the short semi-axis, px."""
+    FIT_NCC = 9
+    """-log(1.01 - correlation of the fit)."""
+    FIT_UNEXPLAINED = 10
+    """Log of the residuals of the fit beyond the noise, in contrasts."""
+    FIT_BLUR = 11
+    """Blur in short semi-axes."""
+    FIT_SHIFT = 12
+    """Log of the distance from the network's place, by the fit."""
+    FIT_MOVE = 13
+    """Log of the distance from the pose before the fit."""
+    FIT_CONTRAST = 14
+    """Log of the contrast over the range of the image, by the fit."""
+    FIT_CONTRAST_TO_NOISE = 15
+    """Log of the contrast over the noise, by the fit."""
+    FIT_RADIUS = 16
+    """Log of the short semi-axis, px, by the fit."""
+    FIRST_JUDGE = 17
+    """Log odds by the first judge."""
+    OTHER_PATCHES = 18
+    """Log of 1 + the number of other patches that the image probably has."""
+    OTHER_ERRORS = 19
+    """Log of 1 + the number of other hypotheses that are probably wrong."""
+    OTHER_BLUR = 20
+    """Log of the blur, px, over the blur of the other patches."""
+    OTHER_CONTRAST = 21
+    """Log of the contrast over the contrast of the other patches."""
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """n hypotheses: each says that a place lies on a patch of some design, in some pose.
+
+    Attributes
+    ----------
+    place : ndarray of shape (n,), int64
+        Index of the place among the candidates.
+    place_xy : ndarray of shape (n, 2)
+        That place, px.
+    design : ndarray of shape (n,), int64
+        Index of the design.
+    xy, A : ndarray of shape (n, 2) and (n, 2, 2)
+        Pose: the centre, px, and the map from the patch frame to px.
+    view : ndarray of shape (n, VIEW_PX²)
+        From :func:`kpbench.fitting.views.rectify`; nan outside the image.
+    blur_px : ndarray of shape (n,)
+        Standard deviation of the blur by the fit, px; 0 before the fit.
+    evidence : ndarray of shape (n, columns)
+        Columns of :class:`Evidence`.
+    """
+
+    place: Int
+    place_xy: Float
+    design: Int
+    xy: Float
+    A: Float
+    view: NDArray[np.floating[Any]]
+    blur_px: Float
+    evidence: Float
+
+    def __len__(self) -> int:
+        return len(self.place)
+
+    def __getitem__(self, keep: Any) -> Hypotheses:
+        return Hypotheses(*(column[keep] for column in vars(self).values()))
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Hypotheses]) -> Hypotheses:
+        """Return the hypotheses of all parts, one part after the other."""
+        return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+def select_likeliest(place: Int, log_odds: Float) -> Int:
+    """Return the index of the likeliest hypothesis of each place, in the order of the places."""
+    order = np.lexsort((-log_odds, place))
+    return order[np.flatnonzero(np.diff(place[order], prepend=-1))]
+
+
+def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
+    """Return the indices of hypotheses from ``least_log_odds`` on, without near repetitions of the same design."""
+    likely = np.flatnonzero(log_odds >= least_log_odds)
+    kept = [np.zeros(0, np.int64)]
+    for design in np.unique(hypotheses.design[likely]):
+        rows = likely[hypotheses.design[likely] == design]
+        reach = MERGE_DISTANCE * clipped_semi_axis(hypotheses.A[rows])
+        kept.append(rows[suppress(hypotheses.xy[rows], log_odds[rows], reach)])
+    return np.sort(np.concatenate(kept))
+
+
+def judge_inputs(hypotheses: Hypotheses, patches: Sequence[Patch]) -> dict[str, Float32]:
+    """Return the inputs of a judge's network.
+
+    Returns
+    -------
+    dict
+        ``view`` (n, 2, VIEW_PX, VIEW_PX): the image and the design in the frame of the patch. The design is as
+        blurred as the fit found the image. Both are 0 outside the image. ``evidence`` (n, columns).
+    """
+    design = build_templates(patches).view[hypotheses.design]
+    soft = np.flatnonzero(hypotheses.blur_px)
+    design[soft] = blur_views(design[soft], hypotheses.A[soft], hypotheses.blur_px[soft])
+    pair = np.stack([hypotheses.view, design], axis=1)
+    pair[np.broadcast_to(np.isnan(hypotheses.view)[:, None], pair.shape)] = 0
+    return {"view": pair.reshape(-1, 2, VIEW_PX, VIEW_PX), "evidence": hypotheses.evidence.astype(np.float32)}
+
+
+def clipped_semi_axis(A: Float) -> Float:
+    """Return the short semi-axes (n,) of maps (n, 2, 2), px, at least 0.5."""
+    return np.maximum(short_semi_axis(A), 0.5)

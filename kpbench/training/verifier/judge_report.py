@@ -1,0 +1,90 @@
+"""How good judges are: detection scores of a test dataset at several rates of false alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.detectors.hypotheses import Hypotheses, select_likeliest
+from kpbench.detectors.superpoint import DISC_SHARE, Decoding
+from kpbench.detectors.suppression import suppress
+from kpbench.fitting.align import short_semi_axis
+from kpbench.patches.design import Patch
+from kpbench.training.verifier.judge_network import Judge, apply_judge
+from kpbench.training.verifier.judge_samples import ImageFits, ImageLooks
+from kpbench.training.verifier.labels import FIT_TOLERANCE, POSE_TOLERANCE, design_ids, mark_correct
+from kpbench.training.verifier.small_networks import Say
+from kpbench.types import Float
+
+FALSE_ALARM_RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
+"""False alarms per image."""
+THRESHOLDS = (0.3, 0.5)
+"""Scores, as probabilities."""
+
+
+def report_judges(
+    looks: Sequence[ImageLooks], fits: Sequence[ImageFits], second: Judge, patches: Sequence[Patch], say: Say
+) -> None:
+    """Report the detection scores of the network's candidates, of the first judge, and of the second judge."""
+    truths, images = sum(len(image.keypoints) for image in looks), len(looks)
+    say(f"{images} images, {truths} keypoints")
+    say("false alarms per image     " + "".join(f"{rate:8}" for rate in FALSE_ALARM_RATES))
+    keypoints = [image.keypoints for image in looks]
+    corrected, fitted = [image.corrected for image in fits], [image.fitted for image in fits]
+    candidates = [(image.candidate_score, image.candidate_right) for image in looks]
+    _report_scores("candidates", [(np.log(s / (1.0001 - s)), right) for s, right in candidates], truths, say)
+    for name, log_odds, hypotheses in (
+        ("first judge", [image.log_odds for image in fits], corrected),
+        ("second judge", [apply_judge(second, one, patches)[0] for one in fitted], fitted),
+    ):
+        rows = zip(log_odds, hypotheses, keypoints, strict=True)
+        _report_scores(name, [_select_reported(*row, patches) for row in rows], truths, say)
+    places = sum(image.first_look.place.max(initial=-1) + 1 for image in looks)
+    say(f"fitted: {sum(map(len, fitted)) / images:.1f} of {places / images:.1f} places")
+    for name, parts, tolerance in (
+        ("proposed", [image.first_look for image in looks], POSE_TOLERANCE),
+        ("corrected", corrected, FIT_TOLERANCE),
+        ("fitted", fitted, FIT_TOLERANCE),
+    ):
+        explained = sum(_count_explained(*pair, patches, tolerance) for pair in zip(parts, keypoints, strict=True))
+        say(f"keypoints that a {name} hypothesis explains: {explained / truths:.3f}")
+
+
+def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]]], truths: int, say: Say) -> None:
+    """Report the detection scores of detections, given as (log odds, whether right) per image."""
+    parts = list(of_images)
+    log_odds, right = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(-log_odds, kind="stable")
+    alarms, found = np.cumsum(~right[order]) / len(parts), np.cumsum(right[order]) / truths
+    last = np.maximum(np.searchsorted(alarms, FALSE_ALARM_RATES, side="right") - 1, 0)
+    say(f"{name:27}" + "".join(f"{value:8.3f}" for value in found[last]))
+    for threshold in THRESHOLDS:
+        kept = log_odds >= np.log(threshold / (1 - threshold))
+        say(
+            f"    at {threshold}: detection {(right & kept).sum() / truths:.3f}, "
+            f"alarms {(~right & kept).sum() / len(parts):.3f}"
+        )
+
+
+def _count_explained(
+    hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch], tolerance: float
+) -> int:
+    """Return the number of keypoints that have a right hypothesis."""
+    ids = design_ids(hypotheses, patches)
+    explained = [mark_correct(hypotheses.xy, ids, keypoints[k : k + 1], tolerance) for k in range(len(keypoints))]
+    return sum(bool(right.any()) for right in explained)
+
+
+def _select_reported(
+    log_odds: Float, hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch]
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return log odds and rightness of the hypotheses that a detector would report, whatever their score."""
+    best = select_likeliest(hypotheses.place, log_odds)
+    hypotheses, log_odds = hypotheses[best], log_odds[best]
+    reach = np.maximum(Decoding.separation_px, DISC_SHARE * short_semi_axis(hypotheses.A))
+    kept = suppress(hypotheses.xy, log_odds, reach)
+    ids = design_ids(hypotheses, patches)
+    return log_odds[kept], mark_correct(hypotheses.xy, ids, keypoints, FIT_TOLERANCE)[kept]

@@ -1,0 +1,151 @@
+"""Hypotheses of synthetic images, which the judges are trained on."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass, replace
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from kpbench.detectors.hypotheses import Hypotheses, select_distinct
+from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
+from kpbench.detectors.verification import (
+    FIRST_JUDGE,
+    LEAST_FIT_LOG_ODDS,
+    SECOND_LOOK_LOG_ODDS,
+    fit_hypotheses,
+    judge,
+    look_again,
+    propose_poses,
+)
+from kpbench.fitting.pyramid import Pyramids
+from kpbench.training.verifier.judge_network import Judge, apply_judge
+from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
+from kpbench.training.verifier.small_networks import ImageRef
+from kpbench.types import Float, UInt8
+
+TRAINING_MARGIN = 1.0
+"""Training looks again at, and fits, hypotheses whose log odds are below the detector's limits by up to this."""
+SPECKLED_EVERY = 3
+"""One in so many training images is strewn with specks."""
+
+
+@dataclass(frozen=True)
+class ImageLooks:
+    """What is known of one image before the fit.
+
+    Attributes
+    ----------
+    keypoints : structured ndarray
+        The truth.
+    candidate_score : ndarray of shape (n,)
+        Score of each candidate of the network.
+    candidate_right : ndarray of shape (n,), bool
+    first_look, second_look : Hypotheses
+        Proposed poses, and those that the shipped first judge corrected and would look at again.
+    shipped_log_odds : ndarray
+        Log odds of both looks, one after the other, by the shipped first judge.
+    """
+
+    keypoints: NDArray[Any]
+    candidate_score: Float
+    candidate_right: NDArray[np.bool_]
+    first_look: Hypotheses
+    second_look: Hypotheses
+    shipped_log_odds: Float
+
+
+@dataclass(frozen=True)
+class ImageFits:
+    """What is known of one image after the fit.
+
+    Attributes
+    ----------
+    log_odds : ndarray of shape (n,)
+        By the new first judge, at its second look.
+    corrected : Hypotheses
+        In the poses that it takes for right.
+    fitted : Hypotheses
+    """
+
+    log_odds: Float
+    corrected: Hypotheses
+    fitted: Hypotheses
+
+
+@cache
+def load_places_detector(path: Path | None) -> SuperPointDetector:
+    """Return the detector whose candidates are judged; each process loads it once."""
+    return SuperPointDetector(path) if path else SmallSuperPointDetector()
+
+
+@lru_cache(maxsize=1)
+def _unpack_judge(packed: bytes) -> Judge:
+    return cast(Judge, pickle.loads(packed))
+
+
+def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
+    """Return the hypotheses of one image at the first judge's two looks; ``train`` adds specks and weak hypotheses."""
+    detector = load_places_detector(detector_path)
+    grey, keypoints = read_image(image, train)
+    xy, score, log_id = detector.candidates([grey])[0]
+    patch_ids = np.array([patch.patch_id for patch in detector.patches])[log_id[:, :-1].argmax(axis=1)]
+    right = mark_correct(xy, patch_ids, keypoints, FIT_TOLERANCE)
+    pyramids = Pyramids(grey)
+    first_look = propose_poses(pyramids, xy, score, log_id, detector.patches)
+    log_odds, corrected = judge(FIRST_JUDGE, first_look, detector.patches)
+    again = corrected[log_odds >= SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN]
+    second_look = look_again(pyramids, again, detector.patches)
+    log_odds = np.concatenate([log_odds, judge(FIRST_JUDGE, second_look, detector.patches)[0]])
+    return ImageLooks(keypoints, score, right, _halve_memory(first_look), _halve_memory(second_look), log_odds)
+
+
+def _halve_memory(hypotheses: Hypotheses) -> Hypotheses:
+    return replace(hypotheses, view=hypotheses.view.astype(np.float16))
+
+
+def collect_fits(
+    detector_path: Path | None, packed_judge: bytes, train: bool, image: ImageRef, first_look: Hypotheses
+) -> ImageFits:
+    """Return the hypotheses of one image after two looks of the new first judge and after the fit.
+
+    ``train`` : lower the limits of the detector. The first judge knows the images that trained it too well, and would
+    leave too few wrong hypotheses for the second judge.
+    """
+    patches, new_judge = load_places_detector(detector_path).patches, _unpack_judge(packed_judge)
+    pyramids, margin = Pyramids(read_image(image, train)[0]), TRAINING_MARGIN if train else 0.0
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # one image is too little work for more
+    log_odds, corrected = apply_judge(new_judge, first_look, patches)
+    second_look = look_again(pyramids, corrected[log_odds >= SECOND_LOOK_LOG_ODDS - margin], patches)
+    log_odds, corrected = apply_judge(new_judge, second_look, patches)
+    torch.set_num_threads(threads)
+    chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS - margin)
+    log_odds, corrected = log_odds[chosen], corrected[chosen]
+    fitted = fit_hypotheses(pyramids, corrected, log_odds, patches)
+    return ImageFits(log_odds, _halve_memory(corrected), _halve_memory(fitted))
+
+
+def read_image(image: ImageRef, speckle: bool) -> tuple[UInt8, NDArray[Any]]:
+    """Return one image in grey and its keypoints; with ``speckle``, one image in three has specks beside its patches.
+
+    Specks measure 1 to 6 px. They stand for hot pixels, dust, and leaves and windows far away, which look most like
+    small patches.
+    """
+    grey, keypoints = image.read()
+    if not speckle or image.index % SPECKLED_EVERY:
+        return grey, keypoints
+    grey, rng = grey.copy(), image.rng()
+    xy = rng.uniform(0, grey.shape[::-1], (rng.integers(1, 40) * grey.size // 200_000, 2))
+    apart = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"]) > keypoints["radius_major"] + 4
+    for x, y in np.rint(16 * xy[apart.all(axis=1)]).astype(int).tolist():
+        axes = np.rint(16 * rng.uniform(0.4, 3.0, 2)).astype(int).tolist()
+        level = float(rng.choice([0, 255, int(rng.integers(256))]))
+        cv2.ellipse(grey, (x, y), axes, float(rng.uniform(0, 180)), 0, 360, level, -1, cv2.LINE_AA, 4)
+    return grey, keypoints

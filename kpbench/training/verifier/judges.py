@@ -1,0 +1,231 @@
+"""Training of the two judges (:func:`kpbench.detectors.verification.judge`).
+
+Both judges have the same small network. For the first judge, before the fit, a hypothesis is right if its centre lies
+within a fifth of the radius of a keypoint of its design; for the second, after the fit, within a tenth. Of two
+rotations of a design at one place, the better one is right. Each judge also learns the error of the pose.
+
+The first judge is trained on its first and its second look. The shipped first judge corrects the poses for the second
+look, because the new one does not exist yet. A hypothesis that the shipped first judge already knows is drawn rarely,
+with more weight.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import repeat
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from kpbench.dataset.folder import Dataset
+from kpbench.detectors.hypotheses import Hypotheses
+from kpbench.detectors.verification import FIRST_JUDGE, SECOND_JUDGE
+from kpbench.patches.design import Patch
+from kpbench.training.verifier.judge_network import Judge, input_tensors
+from kpbench.training.verifier.judge_report import report_judges
+from kpbench.training.verifier.judge_samples import ImageLooks, collect_fits, collect_looks, load_places_detector
+from kpbench.training.verifier.labels import FIT_TOLERANCE, POSE_TOLERANCE, label_hypotheses, pose_errors
+from kpbench.training.verifier.small_networks import (
+    BATCHNORM_SAMPLES,
+    CONTINUED_LEARNING_RATE,
+    LEARNING_RATE,
+    Say,
+    load_shipped,
+    map_images,
+    prepare_training,
+    train_one_cycle,
+    write_network,
+)
+from kpbench.types import Float
+
+FIRST_WIDTH, SECOND_WIDTH = 32, 48
+"""Channels of the first layers of each judge."""
+KNOWN_SHARE = 12.0
+"""A hypothesis that is rightly judged with log odds z is drawn in an epoch with probability KNOWN_SHARE · exp(-z/2)."""
+
+
+def train_judges(
+    datasets: Sequence[Dataset],
+    test: Dataset,
+    out: Path,
+    *,
+    detector: Path | None = None,
+    epochs: int = 10,
+    batch: int = 256,
+    from_shipped: bool = False,
+    workers: int = 1,
+    threads: int | None = None,
+    say: Say = lambda line: None,
+) -> None:
+    """Train the two judges and write them as ``first-judge.onnx`` and ``second-judge.onnx``.
+
+    Parameters
+    ----------
+    datasets : sequence of Dataset
+        Synthetic images to train on.
+    test : Dataset
+        Synthetic images for the report: detection scores at several rates of false alarms.
+    out : Path
+        Folder for the files.
+    detector : Path, optional
+        Weights whose candidates are judged, written by ``kpbench export-model``. None: ``superpoint-small``.
+    epochs, batch : int
+        Passes over the hypotheses, and hypotheses per step.
+    from_shipped : bool
+        Start from the shipped weights; with ``epochs=0`` the report tells how good these are.
+    workers : int
+        Processes that collect hypotheses; 0: none but this one.
+    threads : int, optional
+        Threads of PyTorch.
+    say : callable
+        Receives the report, line by line.
+
+    Raises
+    ------
+    DataError
+        If a dataset or the detector cannot be read, or the folder cannot be written.
+    """
+    prepare_training(out, threads)
+    patches = load_places_detector(detector).patches
+    sets = [*datasets, test]
+    looks = [
+        map_images(partial(collect_looks, detector), part, repeat(part is not test, len(part)), workers, f"look {n}")
+        for n, part in enumerate(sets)
+    ]
+    first = _train_first([image for part in looks[:-1] for image in part], patches, epochs, batch, from_shipped, say)
+    packed = pickle.dumps(first)
+    fits = [
+        map_images(
+            partial(collect_fits, detector, packed, part is not test),
+            part,
+            [image.first_look for image in of_part],
+            workers,
+            f"fit {n}",
+        )
+        for n, (part, of_part) in enumerate(zip(sets, looks, strict=True))
+    ]
+    truths = [image.keypoints for part in looks[:-1] for image in part]
+    fitted = [image.fitted for part in fits[:-1] for image in part]
+    unknown = np.zeros(sum(map(len, fitted)))
+    training = _label(fitted, patches, truths, unknown, FIT_TOLERANCE)
+    second = _train(training, patches, SECOND_WIDTH, epochs, batch, SECOND_JUDGE if from_shipped else None, say)
+    report_judges(looks[-1], fits[-1], second, patches, say)
+    for name, network, seen in (
+        (FIRST_JUDGE, first, [image.first_look for image in looks[-1]]),
+        (SECOND_JUDGE, second, [image.fitted for image in fits[-1]]),
+    ):
+        inputs = [input_tensors(hypotheses, patches) for hypotheses in seen if len(hypotheses)][:100]
+        write_network(network, ["view", "evidence"], inputs, out / f"{name}.onnx", say)
+
+
+@dataclass(frozen=True)
+class LabelledHypotheses:
+    """Hypotheses of many images, and what a judge is asked for.
+
+    Attributes
+    ----------
+    hypotheses : Hypotheses
+    right, near : ndarray of shape (n,), bool
+        Whether each is right, and whether it teaches the pose.
+    shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
+        Corrections that bring the pose to the truth.
+    share : ndarray of shape (n,)
+        Probability with which each is drawn in an epoch; its weight is the inverse.
+    """
+
+    hypotheses: Hypotheses
+    right: NDArray[np.bool_]
+    near: NDArray[np.bool_]
+    shift: Float
+    log_map: Float
+    share: Float
+
+
+def _label(
+    hypotheses: Sequence[Hypotheses],
+    patches: Sequence[Patch],
+    truths: Sequence[NDArray[Any]],
+    known_log_odds: Float,
+    tolerance: float,
+) -> LabelledHypotheses:
+    """Label the hypotheses of many images; an earlier judge gave them ``known_log_odds`` (0: no earlier judge)."""
+    pairs = list(zip(hypotheses, truths, strict=True))
+    right = np.concatenate([label_hypotheses(part, patches, truth, tolerance) for part, truth in pairs])
+    errors = zip(*(pose_errors(part, patches, truth) for part, truth in pairs), strict=True)
+    near, shift, log_map = (np.concatenate(column) for column in errors)
+    share = np.minimum(KNOWN_SHARE * np.exp(np.where(right, -known_log_odds, known_log_odds) / 2), 1.0)
+    return LabelledHypotheses(Hypotheses.concatenate(hypotheses), right, near, shift, log_map, share)
+
+
+def _train_first(
+    looks: Sequence[ImageLooks],
+    patches: Sequence[Patch],
+    epochs: int,
+    batch: int,
+    from_shipped: bool,
+    say: Say,
+) -> Judge:
+    """Train the first judge on the hypotheses of both looks."""
+    hypotheses = [look for image in looks for look in (image.first_look, image.second_look)]
+    truths = [image.keypoints for image in looks for _ in range(2)]
+    known = np.concatenate([image.shipped_log_odds for image in looks])
+    training = _label(hypotheses, patches, truths, known, POSE_TOLERANCE)
+    return _train(training, patches, FIRST_WIDTH, epochs, batch, FIRST_JUDGE if from_shipped else None, say)
+
+
+def _train(
+    training: LabelledHypotheses,
+    patches: Sequence[Patch],
+    width: int,
+    epochs: int,
+    batch: int,
+    shipped: str | None,
+    say: Say,
+) -> Judge:
+    """Train a judge, from the shipped weights of that name if any.
+
+    Minimises the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
+    """
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    whole, share = training.hypotheses, training.share
+    target, near = torch.from_numpy(training.right).float(), torch.from_numpy(training.near)
+    shift, log_map = torch.from_numpy(training.shift).float(), torch.from_numpy(training.log_map).float()
+    weight = torch.from_numpy(1 / share).float()
+
+    def draw_rows() -> Tensor:
+        return torch.from_numpy(rng.permutation(np.flatnonzero(rng.random(len(share)) < share)))
+
+    some_evidence = whole.evidence[:: max(1, len(whole) // 100_000)]
+    network = Judge(some_evidence, width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    if shipped:
+        load_shipped(network, shipped, input_tensors(whole[rng.permutation(len(whole))[:BATCHNORM_SAMPLES]], patches))
+
+    def loss(rows: Tensor) -> Tensor:
+        view, evidence = input_tensors(whole[rows.numpy()], patches)
+        odds, predicted_shift, predicted_map = (part.float() for part in network(_disturb(view), evidence))
+        value = nn.functional.binary_cross_entropy_with_logits(odds, target[rows], weight[rows])
+        if (taught := near[rows]).any():
+            value = value + nn.functional.smooth_l1_loss(predicted_shift[taught], shift[rows][taught], beta=0.02)
+            value = value + nn.functional.smooth_l1_loss(predicted_map[taught], log_map[rows][taught], beta=0.05)
+        return value
+
+    say(f"train on {len(share)} hypotheses, {training.right.mean():.0%} right, {share.sum():.0f} per epoch")
+    learning_rate = CONTINUED_LEARNING_RATE if shipped else LEARNING_RATE
+    train_one_cycle(network, loss, draw_rows, epochs, batch, learning_rate)
+    return cast(Judge, network)
+
+
+def _disturb(view: Tensor) -> Tensor:
+    """Return views with other inks of the image and a little noise; the design stays as it is."""
+    shape = (len(view), 1, 1, 1)
+    gain, offset = torch.exp(0.15 * torch.randn(shape)), 0.1 * torch.randn(shape)
+    image = view[:, :1] * gain + offset + 0.1 * torch.rand(shape) * torch.randn_like(view[:, :1])
+    return torch.cat([torch.where(view.any(dim=1, keepdim=True), image, 0.0), view[:, 1:]], dim=1)

@@ -1,0 +1,94 @@
+"""Labels of hypotheses: which ones are right, and how far their poses are from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.detectors.hypotheses import Hypotheses
+from kpbench.detectors.verification import move_poses
+from kpbench.fitting.templates import build_templates
+from kpbench.patches.design import Patch
+from kpbench.training.verifier.small_networks import affine_at_centre, log_ellipse
+from kpbench.types import Float, Int
+
+POSE_TOLERANCE, FIT_TOLERANCE = 0.2, 0.1
+"""Largest distance of a right centre from the truth, before and after the fit, in long semi-axes."""
+NEAR_RADII = 0.5
+"""Long semi-axes. A hypothesis of the right design teaches the pose if its centre is nearer to the truth than this."""
+LARGEST_LOG_MAP = 1.0
+"""A hypothesis whose pose is off by more than this in any entry of the log map does not teach the pose."""
+
+
+def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
+    """Return the patch ID (n,) of each hypothesis."""
+    return np.array([patch.patch_id for patch in patches])[hypotheses.design]
+
+
+def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
+    """Return whether each place (n, 2) px lies near its nearest keypoint and has the patch ID of that keypoint.
+
+    ``tolerance`` : largest distance, in long semi-axes.
+    """
+    if not len(keypoints):
+        return np.zeros(len(xy), bool)
+    nearest, distance = _nearest_keypoint(xy, keypoints)
+    return np.asarray((distance <= tolerance) & (keypoints["patch_id"][nearest] == patch_ids))
+
+
+def _nearest_keypoint(xy: Float, keypoints: NDArray[Any]) -> tuple[Int, Float]:
+    """Return the nearest keypoint (n,) of each place, and its distance (n,), in its long semi-axes."""
+    distance = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"]) / keypoints["radius_major"]
+    return distance.argmin(axis=1), distance.min(axis=1)
+
+
+def label_hypotheses(
+    hypotheses: Hypotheses, patches: Sequence[Patch], keypoints: NDArray[Any], tolerance: float
+) -> NDArray[np.bool_]:
+    """Return whether each hypothesis of an image is right.
+
+    A right hypothesis lies within ``tolerance`` long semi-axes of a keypoint and has its design. Of two rotations of a
+    design at one place, only the better one is right.
+    """
+    right = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, tolerance)
+    rows = np.flatnonzero(right)
+    if len(rows):
+        own, _ = _nearest_keypoint(hypotheses.xy[rows], keypoints)
+        relative = np.linalg.inv(hypotheses.A[rows]) @ affine_at_centre(keypoints["H_patch2image"][own])
+        angle = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
+        # a design that looks the same after half a turn has half as many rotations
+        rotations = np.bincount(build_templates(patches).whole.rotated_design)
+        period = (2 * np.pi * rotations / rotations.max())[hypotheses.design[rows]]
+        error = np.abs((angle + period / 2) % period - period / 2)
+        order = np.lexsort((error, hypotheses.design[rows], hypotheses.place[rows]))
+        key = np.column_stack([hypotheses.place[rows], hypotheses.design[rows]])[order]
+        right[rows[order[1:][(key[1:] == key[:-1]).all(axis=1)]]] = False
+    return right
+
+
+def pose_errors(
+    hypotheses: Hypotheses, patches: Sequence[Patch], keypoints: NDArray[Any]
+) -> tuple[NDArray[np.bool_], Float, Float]:
+    """Return the corrections that bring the poses of an image's hypotheses to the truth.
+
+    Returns
+    -------
+    near : ndarray of shape (n,), bool
+        Hypotheses of the right design whose pose is near the truth; the others have a correction of 0.
+    shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
+        See :func:`kpbench.detectors.verification.move_poses`.
+    """
+    shift, log_map = np.zeros((len(hypotheses), 2)), np.zeros((len(hypotheses), 2, 2))
+    near = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, NEAR_RADII)
+    if near.any():
+        xy, A = hypotheses.xy[near], hypotheses.A[near]
+        centres = np.column_stack([keypoints["x"], keypoints["y"]])
+        own, _ = _nearest_keypoint(xy, keypoints)
+        log_map[near] = log_ellipse(np.linalg.inv(A) @ affine_at_centre(keypoints["H_patch2image"][own]))
+        _, true_A = move_poses(xy, A, shift[near], log_map[near])
+        shift[near] = np.linalg.solve(true_A, (centres[own] - xy)[:, :, None])[:, :, 0]
+        near[near] = np.abs(log_map[near]).max(axis=(1, 2)) < LARGEST_LOG_MAP
+    return near, shift, log_map
