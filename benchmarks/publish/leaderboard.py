@@ -135,7 +135,7 @@ def summary(runs: list[dict[str, Any]]) -> Table:
             for run in runs
         ),
     ]
-    return Table("", ("detection score, mean of the rungs", "images", *PAPER, "false alarms an image"), tuple(rows))
+    return Table("", ("detection score, mean of the rungs", "images", *PAPER, "false alarms per image"), tuple(rows))
 
 
 def readme(text: str, runs: list[dict[str, Any]]) -> str:

@@ -148,9 +148,9 @@ def open_coco(path: str | Path) -> CocoDataset:
     """Read true keypoints from a COCO annotations file.
 
     Each annotation has one keypoint ``[x, y, v]`` and its radius in px: ``radius``, or ``radius_major`` and
-    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` less 1, as ``kpbench export
-    --format coco`` numbers the categories. Images may have a ``condition`` (text), a ``rung`` (number) and a
-    ``scene_id`` (whole number).
+    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` less 1, as
+    :func:`kpbench.export_dataset` numbers the categories. Images may have a ``condition`` (text), a ``rung`` (number)
+    and a ``scene_id`` (whole number).
 
     Parameters
     ----------
@@ -281,7 +281,7 @@ def decode_coco_results(data: bytes) -> Predictions:
     """Decode COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``.
 
     Each entry is a detection with one keypoint, whose visibility v is ignored. Its patch ID is the category ID less 1,
-    as ``kpbench export --format coco`` numbers the categories. Results cannot name images without detections.
+    as :func:`kpbench.export_dataset` numbers the categories. Results cannot name images without detections.
 
     Raises
     ------

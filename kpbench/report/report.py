@@ -116,37 +116,37 @@ class Section:
 def make_sections(report: Report) -> list[Section]:
     """Make the sections of a report, in order. A section without content is left out."""
     makers = (
-        _overview,
-        _compared,
-        _beside_the_paper,
-        _severity,
-        _precision_and_recall,
-        _localisation,
-        _pose,
-        _identities,
-        _worst_cases,
-        _all_groups,
+        _overview_section,
+        _comparison_section,
+        _paper_section,
+        _severity_section,
+        _precision_recall_section,
+        _radius_section,
+        _pose_section,
+        _identity_section,
+        _worst_cases_section,
+        _all_groups_section,
     )
     return [section for make in makers for section in [make(report)] if section.blocks]
 
 
-def _overview(report: Report) -> Section:
+def _overview_section(report: Report) -> Section:
     runs, settings = report.runs, report.runs[0].settings
     return Section(
         "Overview",
-        f"A detection matches a keypoint at most {settings.eps:g} of its {settings.eps_radius} radius away "
-        f"({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
+        f"A detection can match a keypoint at a distance of at most {settings.eps:g} of the keypoint's "
+        f"{settings.eps_radius} radius ({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
         (overview_table(runs), count_table(runs), *taxonomy_charts(runs)),
     )
 
 
-def _compared(report: Report) -> Section:
+def _comparison_section(report: Report) -> Section:
     comparisons = report.comparisons
     tables = [verdict_table(comparisons), *map(difference_table, comparisons)] if comparisons else []
     return Section("Compared", "Differences are paired: the same scenes are resampled for both.", tuple(tables))
 
 
-def _beside_the_paper(report: Report) -> Section:
+def _paper_section(report: Report) -> Section:
     known = [PAPER[name] for name in _conditions(report) if name in PAPER]
     tables = [paper_table(report.runs, table, report.images or "the user's") for table in known]
     deteriorate, limits = str(report.config.get("deteriorate")), report.config.get("limits", {})
@@ -155,45 +155,45 @@ def _beside_the_paper(report: Report) -> Section:
         tables.append(synthetic_table(report.runs, deteriorate))
     return Section(
         "Beside the paper",
-        "The paper's photographs are not public. Its numbers and ours are from different images and different "
-        "prints, so they may be compared in shape, not digit by digit.",
+        "The paper's photographs are not public. Its numbers and ours are of different images and different prints, "
+        "so the shapes of the curves can be compared, but not the digits.",
         tuple(tables),
     )
 
 
-def _severity(report: Report) -> Section:
+def _severity_section(report: Report) -> Section:
     runs, conditions = report.runs, _conditions(report)
     metrics = ("detection_score", "average_false_alarm")
     charts = [severity_chart(runs, name, metric) for name in conditions for metric in metrics]
     others = [condition_table(runs, name) for name in conditions if name not in PAPER]
     blocks: list[Block] = [breakpoint_table(runs), *charts, *others] if conditions else []
-    return Section("Severity", "Each condition from rung to rung, all patches together.", tuple(blocks))
+    return Section("Severity", "Each condition over its rungs, all patches together.", tuple(blocks))
 
 
-def _precision_and_recall(report: Report) -> Section:
+def _precision_recall_section(report: Report) -> Section:
     return Section(
         "Precision and recall",
-        "Which detections to keep, from the surest only to all; and how near a detection must come.",
+        "Precision and recall at every threshold on the score; detection score at every largest distance of a match.",
         (precision_recall_chart(report.runs), eps_chart(report.runs)),
     )
 
 
-def _localisation(report: Report) -> Section:
+def _radius_section(report: Report) -> Section:
     runs = report.runs
     bins = [(run, [g for g in run.by if g.key.radius_px is not None]) for run in runs]
     blocks: tuple[Block, ...] = ()
     if bins[0][1]:
         charts = (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"))
         blocks = (*charts, *(group_table(groups, f"By radius: {run.name}") for run, groups in bins))
-    lead = "Errors are of matches only, so they cannot exceed the reach of a match."
+    lead = "Only matches have errors, so no error exceeds the largest distance of a match."
     return Section("Localisation by radius", lead, blocks)
 
 
-def _pose(report: Report) -> Section:
+def _pose_section(report: Report) -> Section:
     return Section("Pose", "The board's pose from the matched detections, by solvePnP.", report.poses)
 
 
-def _identities(report: Report) -> Section:
+def _identity_section(report: Report) -> Section:
     return Section(
         "Identities",
         "Matched detections: true ID in rows, detected ID in columns; other is an ID that no true keypoint has.",
@@ -201,17 +201,17 @@ def _identities(report: Report) -> Section:
     )
 
 
-def _worst_cases(report: Report) -> Section:
+def _worst_cases_section(report: Report) -> Section:
     galleries = (Gallery(run.name, cases) for run, cases in zip(report.runs, report.cases, strict=True))
     return Section(
         "Worst cases",
-        "The images with most failures, shared out among the conditions. Ellipses are true keypoints, crosses are "
+        "The images with most failures, about as many of each condition. Ellipses are true keypoints, crosses are "
         "detections, numbers are IDs.",
         tuple(galleries) if report.cases else (),
     )
 
 
-def _all_groups(report: Report) -> Section:
+def _all_groups_section(report: Report) -> Section:
     listed = [(run, [g for g in run.by if g.key.radius_px is None]) for run in report.runs]
     tables = tuple(group_table(groups, run.name, report.patch_names) for run, groups in listed if groups)
     return Section("All groups", "Everything by condition, rung and patch.", tables)
@@ -243,7 +243,11 @@ def _render_text(
     format_prose: Callable[[str], str],
     provenance: str | None,
 ) -> str:
-    """Render a report in a form of plain text; titles and provenance are templates with one ``{}``."""
+    """Render a report as plain text.
+
+    ``title``, ``section_title`` and ``provenance`` are templates with one ``{}``. A ``provenance`` of None renders the
+    provenance as prose.
+    """
     parts = [title.format(report.title), format_prose(_describe_images(report))]
     for section in make_sections(replace(report, cases=())):
         parts += [section_title.format(section.title), format_prose(section.lead)]

@@ -62,17 +62,16 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
     >>> table.columns[3:], table.rows[0][:4]
     (('3 px', '7 px', '11 px', '15 px'), ('detection', 'paper', 'photographs', 1.0))
     """
-    ours = sorted({r for run in runs for r in run.conditions.get(table.condition, ())})
-    rungs = sorted({*table.rungs, *ours})
+    rungs = sorted({*table.rungs, *(r for run in runs for r in run.conditions.get(table.condition, ()))})
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
         label = SHORT_LABELS[metric]
-        theirs = [paper_value(table.condition, rung, metric) for rung in rungs]
-        rows.append((label, "paper", table.images, *(None if v is None else float(v) for v in theirs)))
+        paper_values = [paper_value(table.condition, rung, metric) for rung in rungs]
+        rows.append((label, "paper", table.images, *(None if v is None else float(v) for v in paper_values)))
         for run in runs:
             found = [get_estimate(run.group(table.condition, rung), metric) for rung in rungs]
             rows.append((label, run.name, images, *found))
-            rows.append((label, f"{run.name} less the paper", "", *map(_difference, found, theirs)))
+            rows.append((label, f"{run.name} less the paper", "", *map(_subtract_paper, found, paper_values)))
     unit = f" {table.unit}" if table.unit else ""
     title = f"{table.title} (paper: {table.images}; ours: {images})"
     return Table(
@@ -83,12 +82,12 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
     )
 
 
-def _difference(ours: Estimate | None, theirs: float | None) -> Estimate | None:
-    """Return our value less the paper's. The paper gives no intervals, so the interval is that of our value."""
-    if ours is None or ours.value is None or theirs is None:
+def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate | None:
+    """Return an estimate less the paper's value. The paper gives no intervals, so the width of the interval stays."""
+    if estimate is None or estimate.value is None or paper is None:
         return None
-    interval = None if ours.interval is None else (ours.interval[0] - theirs, ours.interval[1] - theirs)
-    return Estimate(ours.value - theirs, interval)
+    interval = estimate.interval
+    return Estimate(estimate.value - paper, interval and (interval[0] - paper, interval[1] - paper))
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
@@ -160,8 +159,8 @@ def group_table(
 ) -> Table:
     """Tabulate the main metrics of groups, one row per group.
 
-    The columns of condition, rung, patch and radius stand where a group has any. The paper's formulas as printed
-    stand where they differ from the one-to-one metrics in a group.
+    Condition, rung, patch and radius have a column if some group has one. The paper's formulas as printed have a column
+    if they differ from the metrics of one-to-one matching in some group.
 
     Parameters
     ----------
@@ -222,7 +221,7 @@ def count_table(runs: Sequence[Scores]) -> Table:
         "clutter",
     )
     rows = tuple((run.name, *(run.overall.counts[name] for name in names)) for run in runs)
-    return Table("What became of keypoints and detections", ("detector", *titles), rows)
+    return Table("Outcomes of keypoints and detections", ("detector", *titles), rows)
 
 
 def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
@@ -302,5 +301,5 @@ def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
     percentiles = ("median", "95th percentile")
     errors = [f"{error}, {percentile}" for error in ("translation (%)", "rotation (°)") for percentile in percentiles]
     columns = ("condition", "rung", "images", "with a pose", *errors)
-    note = "From at least four matched keypoints an image; translation in % of the distance of board and camera."
+    note = "From at least four matched keypoints per image; translation in % of the distance of board and camera."
     return Table(f"Pose of the board: {run.name}", columns, tuple(rows), note)

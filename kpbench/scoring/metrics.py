@@ -70,7 +70,7 @@ COUNTS = (
 LABELS = {
     "detection_score": "detection score",
     "id_matching_score": "ID matching score",
-    "average_false_alarm": "false alarms an image",
+    "average_false_alarm": "false alarms per image",
     "detection_score_literal": "detection score, as printed",
     "id_matching_score_literal": "ID matching score, as printed",
     "average_false_alarm_literal": "false alarms, as printed",

@@ -39,7 +39,7 @@ def test_the_plain_call_finds_kpbench_data(here):
     assert lines[0] == "predictions  preds.json, oracle 2"
     assert "keypoints    4: 4 matched (0 with a wrong ID), 0 missed" in lines
     assert "detection score                1.0000 [1.0000, 1.0000]" in lines
-    assert "false alarms an image          0.0000 [0.0000, 0.0000]" in lines
+    assert "false alarms per image         0.0000 [0.0000, 0.0000]" in lines
     assert "as printed" not in result.stdout  # nothing differs
 
 

@@ -83,7 +83,7 @@ def test_fewer_false_alarms_are_better():
     assert verdict(c, "detection_score").verdict == "even"
     assert c.verdicts("average_false_alarm") == {"better": 2, "even": 0, "worse": 0}
     check_regression([c])
-    with pytest.raises(GateFailed, match=r"^false alarms an image of b is worse than that of a by \+1\.2500 \[\+"):
+    with pytest.raises(GateFailed, match=r"^false alarms per image of b is worse than that of a by \+1\.2500 \[\+"):
         check_regression([compare(run(hits, many, name="b"), run(hits, few))])
 
 
