@@ -42,7 +42,7 @@ ROOMS = {
     "degrade": ["geometry"],
     "dataset": ["geometry"],
     "synth": ["geometry", "patches", "render", "degrade", "dataset"],
-    "analysis": ["geometry", "patches", "printing"],
+    "analysis": ["geometry", "patches", "printing", "render"],
     "predictions": [],
     "scoring": ["geometry"],
     "report": ["scoring"],

@@ -1,1 +1,5 @@
-"""How good a design is, the search for better ones, and its figure."""
+"""Measures of designs: how well they are located, told apart, and told from natural images."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -18,6 +18,8 @@ ICON = 13.0  # radius
 DOT = 1.9  # side of a seen pixel
 BAR, BAR_STEP = 36.0, 4.6
 BARS_X, PAIRS_X = 82.0, 146.0
+FIGURE_SUFFIXES = (".svg", ".png", ".pdf")
+"""Suffixes of files that a figure can be written to."""
 FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # what a whole bar stands for
 
 

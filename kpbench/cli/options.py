@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -48,6 +48,22 @@ class Finite(click.FloatRange):
         if not math.isfinite(number):
             self.fail(f"{value!r} is not a finite number", param, ctx)
         return number
+
+
+class FileOfSuffix(click.Path):
+    """A file to write whose name ends in one of some suffixes.
+
+    The suffixes come from a function, which may import what ``kpbench --help`` must not wait for.
+    """
+
+    def __init__(self, suffixes: Callable[[], Iterable[str]]) -> None:
+        super().__init__(dir_okay=False, path_type=Path)
+        self.suffixes = suffixes
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if Path(value).suffix.lower() not in self.suffixes():
+            self.fail(f"{value}: expected a file ending in {', '.join(self.suffixes())}", param, ctx)
+        return super().convert(value, param, ctx)
 
 
 SIZE = Two(int, "WxH", "x", "640x480")

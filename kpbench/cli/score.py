@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import click
 
 from kpbench.cli.messages import print_warning
-from kpbench.cli.options import Finite
+from kpbench.cli.options import FileOfSuffix, Finite
 
 
 class Limit(click.ParamType[tuple[str, float]]):
@@ -35,15 +35,11 @@ class Limit(click.ParamType[tuple[str, float]]):
         return metric, limit
 
 
-class ReportFile(click.Path):
-    """A file whose suffix is that of a report."""
+def report_suffixes() -> Iterable[str]:
+    """Return the suffixes of reports."""
+    from kpbench.report.report import REPORT_WRITERS
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from kpbench.report.report import REPORT_WRITERS
-
-        if Path(value).suffix.lower() not in REPORT_WRITERS:
-            self.fail(f"{value}: expected a file ending in {', '.join(REPORT_WRITERS)}", param, ctx)
-        return super().convert(value, param, ctx)
+    return REPORT_WRITERS
 
 
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -77,7 +73,7 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
         click.option(
             "--report",
             "report_file",
-            type=ReportFile(dir_okay=False, path_type=Path),
+            type=FileOfSuffix(report_suffixes),
             help="Write tables and charts: .html (one offline page), .md, .tex.",
         ),
     )

@@ -38,7 +38,7 @@ def test_table_json_and_figure(quick, tmp_path):
         (["nowhere.toml"], 1, "nowhere.toml: cannot be read"),
         (["--backgrounds", "nowhere"], 1, "nowhere: no such folder of background images"),
         (["--search", "a.toml"], 2, "--search goes through a whole family of designs and takes no FILES"),
-        (["--figure", "a.gif"], 2, "--figure a.gif: expected a file that ends in .svg, .png or .pdf"),
+        (["--figure", "a.gif"], 2, "'--figure': a.gif: expected a file ending in .svg, .png, .pdf"),
     ],
 )
 def test_bad_input(arguments, code, says, here):
