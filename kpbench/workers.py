@@ -193,7 +193,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
         try:
             yield client.get_executor(pure=False, retries=2)
         except (distributed.KilledWorker, CancelledError):
-            raise DataError(f"{address}: its workers died; `resume=True` keeps finished shards") from None
+            hint = "finished shards are kept, add `resume=True` to go on"
+            raise DataError(f"{address}: its workers died; {hint}") from None
 
 
 def use_one_thread() -> None:

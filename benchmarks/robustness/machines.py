@@ -19,15 +19,11 @@ from pathlib import Path
 import distributed
 
 from kpbench import SynthConfig, generate, merge
-from kpbench.dataset.generation import generate_part
-from kpbench.workers import dask_executor
+from kpbench.dataset import generate_part
 
 
 def by_dask(config: SynthConfig, out: Path) -> str:
-    with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        dask_executor(cluster.scheduler_address) as executor,
-    ):
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
         doomed = cluster.workers[0].pid
         struck = []
 
@@ -38,7 +34,7 @@ def by_dask(config: SynthConfig, out: Path) -> str:
             struck.append(len(list(out.glob("*.h5"))))
 
         threading.Thread(target=strike, daemon=True).start()
-        fingerprint = generate(config, out, executor=executor).dataset.fingerprint
+        fingerprint = generate(config, out, scheduler=cluster.scheduler_address).dataset.fingerprint
         assert struck, "the run ended before the worker was killed"
         print(f"worker {doomed} was killed when {struck[0]} shards were there")
         return fingerprint

@@ -18,14 +18,14 @@ def inspect(dataset: Path) -> None:
     Examples:
       kpbench inspect kpbench-data
     """
-    from kpbench.dataset.card import facts, histograms
+    from kpbench.dataset.card import dataset_facts, dataset_histograms
     from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
     click.echo(f"{'dataset':12} {data.path}")
-    for name, value in facts(data).items():
+    for name, value in dataset_facts(data).items():
         click.echo(f"{name:12} {value}")
-    for histogram in histograms(data):
+    for histogram in dataset_histograms(data):
         click.echo(histogram.title)
         most = max(int(histogram.counts.max()), 1)
         for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True):
@@ -66,13 +66,13 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     Examples:
       kpbench preview kpbench-data --count 20 --columns 5
     """
-    from kpbench.dataset.card import overview
+    from kpbench.dataset.card import draw_overview
     from kpbench.dataset.folder import open_dataset
     from kpbench.files import write_atomic
     from kpbench.images import encode_png
 
     data = open_dataset(dataset)
-    sheet = overview(data, count, columns, tile_width)
+    sheet = draw_overview(data, count, columns, tile_width)
     target = out or data.path / "preview.png"
     write_atomic(target, encode_png(sheet))
     click.echo(str(target))
@@ -81,10 +81,10 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
 @click.command()
 @DATASET
 @click.option(
-    "--format", "form", type=click.Choice(["coco", "yolo", "webdataset"]), required=True, help="Format to write."
+    "--format", "file_format", type=click.Choice(["coco", "yolo", "webdataset"]), required=True, help="Format to write."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="New folder to write into. Default: DATASET-FORMAT.")
-def export(dataset: Path, form: str, out: Path | None) -> None:
+def export(dataset: Path, file_format: str, out: Path | None) -> None:
     """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
 
     \b
@@ -98,4 +98,4 @@ def export(dataset: Path, form: str, out: Path | None) -> None:
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "export") as progress:
-        click.echo(str(export_dataset(data, form, out or Path(f"{dataset}-{form}"), progress)))
+        click.echo(str(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +11,8 @@ from kpbench.cli.messages import print_warning
 from kpbench.cli.options import BACKGROUNDS, PATCHES, SEED, SIZE, Two, run_options
 
 if TYPE_CHECKING:
+    from kpbench.dataset.config import DatasetConfig
     from kpbench.dataset.folder import Dataset
-    from kpbench.dataset.generation import Recipe
 
 
 @click.command()
@@ -127,7 +126,7 @@ def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
 
 
 def write_dataset(
-    recipe: Recipe,
+    config: DatasetConfig,
     out: Path,
     title: str,
     *,
@@ -144,32 +143,28 @@ def write_dataset(
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.generation import generate, generate_part
-    from kpbench.workers import dask_executor
 
     if resume and overwrite:
         raise click.UsageError("--resume and --overwrite exclude each other")
     if (engine == "dask") != (scheduler is not None):
         raise click.UsageError("--engine dask and --scheduler ADDR belong together")
     shards = range(*shard_range) if shard_range else None
-    total = recipe.n if shards is None else min(len(shards) * recipe.shard_size, recipe.n)
-    how: dict[str, Any] = {"workers": workers, "resume": resume, "overwrite": overwrite}
+    total = config.n if shards is None else min(len(shards) * config.shard_size, config.n)
+    how: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "resume": resume, "overwrite": overwrite}
     try:
-        with (
-            contextlib.nullcontext() if scheduler is None else dask_executor(scheduler) as executor,
-            progress_bar(total, title) as progress,
-        ):
-            how |= {"executor": executor, "progress": progress}
+        with progress_bar(total, title) as progress:
+            how["progress"] = progress
             if shards is not None:
-                images = generate_part(recipe, out, shards, **how)
+                images = generate_part(config, out, shards, **how)
                 click.echo(f"{out}: {images} images in shards {shards.start}:{shards.stop}; no manifest yet")
                 return
-            run = generate(recipe, out, **how)
+            result = generate(config, out, **how)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
-    if run.broken:
-        shown = ", ".join(run.broken[:5]) + (" …" if len(run.broken) > 5 else "")
-        print_warning(f"{len(run.broken)} background files could not be decoded and were passed over: {shown}")
-    print_dataset(run.dataset)
+    if result.broken_files:
+        shown = ", ".join(result.broken_files[:5]) + (" …" if len(result.broken_files) > 5 else "")
+        print_warning(f"{len(result.broken_files)} background files could not be decoded and were passed over: {shown}")
+    print_dataset(result.dataset)
 
 
 def print_dataset(dataset: Dataset) -> None:

@@ -1,1 +1,5 @@
-"""The dataset folder: shards and manifest, reading, making, exporting."""
+"""The dataset format: make, read, check, describe and export dataset folders."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

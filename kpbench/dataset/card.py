@@ -1,4 +1,4 @@
-"""What is in a dataset, for people: facts and histograms, and the dataset card made of them."""
+"""The content of a dataset for people: facts, histograms, an overview picture, and the dataset card."""
 
 from __future__ import annotations
 
@@ -15,13 +15,32 @@ from kpbench.files import write_atomic
 from kpbench.images import encode_png
 from kpbench.types import Float, UInt8
 
-FILES = ("README.md", "preview.png")
-"""What :func:`write_card` writes."""
+CARD_FILES = ("README.md", "preview.png")
+"""The files that :func:`write_card` writes: the card and its picture."""
+SIZE_CATEGORIES = (
+    (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
+)  # fmt: skip
+"""Names that the Hugging Face hub gives to datasets of fewer images than a number."""
 
 
 @dataclass(frozen=True)
 class Histogram:
-    """Counts (n,) under n labels."""
+    """A histogram of a dataset.
+
+    Attributes
+    ----------
+    title : str
+    labels : tuple of str
+    counts : ndarray of shape (n,), int64
+        One count per label.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.dataset import Histogram
+    >>> Histogram("patch ID", ("0", "1"), np.array([3, 1])).shares
+    array([0.75, 0.25])
+    """
 
     title: str
     labels: tuple[str, ...]
@@ -29,87 +48,133 @@ class Histogram:
 
     @property
     def shares(self) -> Float:
-        """Of all that was counted, shape (n,)."""
+        """The counts as fractions of their sum, ndarray of shape (n,)."""
         return self.counts / max(int(self.counts.sum()), 1)
 
 
-def names(dataset: Dataset) -> dict[int, str]:
-    """Name of every patch ID, from the dataset's config where it tells them."""
-    told = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
-    return {int(i): told.get(int(i), f"patch-{i}") for i in sorted({*told, *dataset.truth.keypoints["patch_id"]})}
+def patch_names(dataset: Dataset) -> dict[int, str]:
+    """Return the name of every patch ID; ``patch-ID`` where the dataset's config has no name."""
+    known = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
+    ids = sorted({*known, *dataset.truth.keypoints["patch_id"]})
+    return {int(patch_id): known.get(int(patch_id), f"patch-{patch_id}") for patch_id in ids}
 
 
-def facts(dataset: Dataset) -> dict[str, str]:
-    """Name and value of what holds for the whole dataset."""
+def dataset_facts(dataset: Dataset) -> dict[str, str]:
+    """Return facts about the whole dataset, as texts by their names.
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> from kpbench.dataset import dataset_facts
+    >>> dataset_facts(open_dataset("kpbench-data"))["images"]
+    '6 of 640x480, grey'
+    """
     image, config, keypoints = dataset.image(0), dataset.config, dataset.truth.keypoints
     size = sum(shard.bytes for shard in dataset.shards)
-    made = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
-    made += [f"deterioration {config['deteriorate']}"] if "deteriorate" in config else []
-    made += ["radii of {:g} to {:g} px".format(*config["limits"]["radius_px"])] if "limits" in config else []
-    made += [f"up to {config['distractors']} look-alikes an image"] if config.get("distractors") else []
-    made += ["an albumentations pipeline (in dataset.json)"] if config.get("augmentation") else []
+    sources = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
+    if "deteriorate" in config:
+        sources.append(f"deterioration {config['deteriorate']}")
+    if "limits" in config:
+        sources.append("radii of {:g} to {:g} px".format(*config["limits"]["radius_px"]))
+    if config.get("distractors"):
+        sources.append(f"up to {config['distractors']} look-alikes an image")
+    if config.get("augmentation"):
+        sources.append("an albumentations pipeline (in dataset.json)")
     designs = [f"{patch['name']} ({patch['id']})" for patch in config.get("patches", [])]
     return {
         "fingerprint": dataset.fingerprint,
         "images": f"{len(dataset)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}",
         "on disk": f"{size / 1e6:.1f} MB in {len(dataset.shards)} shards, {size / len(dataset) / 1e3:.1f} kB an image",
-        "made from": ", ".join([f"seed {config.get('seed')}", *made]),
+        "made from": ", ".join([f"seed {config.get('seed')}", *sources]),
         "designs": ", ".join(designs) or "n/a",
         "keypoints": f"{len(keypoints)}",
     }
 
 
-def histograms(dataset: Dataset) -> list[Histogram]:
-    """How designs, counts, sizes, tilts and contrasts are distributed."""
+def dataset_histograms(dataset: Dataset) -> list[Histogram]:
+    """Return the distributions of designs, counts, sizes, tilts, contrasts and visible fractions.
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> from kpbench.dataset import dataset_histograms
+    >>> [histogram.title for histogram in dataset_histograms(open_dataset("kpbench-data"))][:2]
+    ['keypoints an image', 'patch ID']
+    """
     keypoints = dataset.truth.keypoints
-    per_image = np.diff(dataset.truth.offsets)
-    made = [_counted("keypoints an image", per_image)]
+    per_image = _count_values("keypoints an image", np.diff(dataset.truth.offsets))
     if not len(keypoints):
-        return made
+        return [per_image]
     major, minor = keypoints["radius_major"], keypoints["radius_minor"]
-    called = names(dataset)
-    by_id = _counted("patch ID", keypoints["patch_id"])
-    by_id = replace(by_id, labels=tuple(f"{label} ({called[int(label)]})" for label in by_id.labels))
+    names = patch_names(dataset)
+    by_id = _count_values("patch ID", keypoints["patch_id"])
+    by_id = replace(by_id, labels=tuple(f"{label} ({names[int(label)]})" for label in by_id.labels))
     tilt_deg = np.degrees(np.arccos(np.clip(minor / major, 0, 1)))
     return [
-        *made,
+        per_image,
         by_id,
-        _binned("radius (major semi-axis), px", major, [0, 5, 8, 12, 20, 32, 50, 80, np.inf]),
-        _binned("short axis (full length), px", 2 * minor, [0, 10, 16, 24, 40, 64, 100, 160, np.inf]),
-        _binned("tilt by the axes, acos(minor / major), degrees", tilt_deg, [0, 15, 30, 45, 60, 75, 90]),
-        _binned("contrast, grey levels", keypoints["contrast"], [-np.inf, 0, 25, 50, 100, 150, 200, 256]),
-        _binned("visible fraction", keypoints["visible"], [0, 0.5, 0.75, 0.99, 1.01]),
+        _bin_values("radius (major semi-axis), px", major, [0, 5, 8, 12, 20, 32, 50, 80, np.inf]),
+        _bin_values("short axis (full length), px", 2 * minor, [0, 10, 16, 24, 40, 64, 100, 160, np.inf]),
+        _bin_values("tilt by the axes, acos(minor / major), degrees", tilt_deg, [0, 15, 30, 45, 60, 75, 90]),
+        _bin_values("contrast, grey levels", keypoints["contrast"], [-np.inf, 0, 25, 50, 100, 150, 200, 256]),
+        _bin_values("visible fraction", keypoints["visible"], [0, 0.5, 0.75, 0.99, 1.01]),
     ]
 
 
-def _counted(title: str, values: ArrayLike) -> Histogram:
-    found, counts = np.unique(np.asarray(values), return_counts=True)
-    return Histogram(title, tuple(map(str, found)), counts)
+def _count_values(title: str, values: ArrayLike) -> Histogram:
+    """Count how often each value occurs."""
+    different, counts = np.unique(np.asarray(values), return_counts=True)
+    return Histogram(title, tuple(map(str, different)), counts)
 
 
-def _binned(title: str, values: ArrayLike, borders: list[float]) -> Histogram:
+def _bin_values(title: str, values: ArrayLike, borders: list[float]) -> Histogram:
+    """Count the values between each two borders."""
     labels = tuple(f"{low:g} to {high:g}" for low, high in pairwise(borders))
     return Histogram(title, labels, np.histogram(np.asarray(values), borders)[0])
 
 
-def overview(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> UInt8:
-    """A contact sheet, RGB, of evenly spaced images with their true keypoints."""
+def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> UInt8:
+    """Draw a contact sheet of evenly spaced images with their true keypoints.
+
+    Parameters
+    ----------
+    dataset : Dataset
+    count : int
+        Number of images.
+    columns : int
+        Images per row.
+    tile_width_px : int
+        Width of an image on the sheet.
+
+    Returns
+    -------
+    ndarray of shape (H, W, 3), uint8
+        RGB.
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> from kpbench.dataset import draw_overview
+    >>> draw_overview(open_dataset("kpbench-data"), count=4, columns=2, tile_width_px=160).shape
+    (252, 332, 3)
+    """
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int)).tolist()
     scale = tile_width_px / dataset.image(0).shape[1]
-    return contact_sheet([draw_keypoints(*dataset[i], scale) for i in chosen], min(columns, len(chosen)))
+    return contact_sheet([draw_keypoints(*dataset[n], scale) for n in chosen], min(columns, len(chosen)))
 
 
 def write_card(dataset: Dataset, folder: Path) -> None:
-    """Write ``README.md``, with the header that dataset hubs read, and its picture into a folder.
+    """Write the dataset card into a folder: ``README.md``, with the header that dataset hubs read, and its picture.
 
     Raises
     ------
     DataError
-        If they cannot be written.
+        If a file cannot be written.
     """
-    write_atomic(folder / FILES[1], encode_png(overview(dataset, 12, 4, 320)))
-    tables = "\n\n".join(map(_table, histograms(dataset)))
-    said = "\n".join(f"| {key} | {value} |" for key, value in facts(dataset).items())
+    card, picture = CARD_FILES
+    write_atomic(folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320)))
+    tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
+    facts = "\n".join(f"| {key} | {value} |" for key, value in dataset_facts(dataset).items())
     versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())
     text = f"""---
 pretty_name: Keypoint patches, {len(dataset)} images
@@ -124,7 +189,7 @@ tags: [keypoint-patches, simulated]
 
 | | |
 |---|---|
-{said}
+{facts}
 
 The images are simulated by kpbench; each is a function of the configuration in `dataset.json`, the seed and the
 background files. Where those are photographs, their licence holds for what is seen of them here.
@@ -139,10 +204,10 @@ image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
 
 Made with {versions}.
 """
-    write_atomic(folder / FILES[0], text.encode(errors="backslashreplace"))
+    write_atomic(folder / card, text.encode(errors="backslashreplace"))
 
 
-def _table(histogram: Histogram) -> str:
+def _markdown_table(histogram: Histogram) -> str:
     rows = [
         f"| {label} | {count} | {share:.1%} |"
         for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True)
@@ -151,6 +216,4 @@ def _table(histogram: Histogram) -> str:
 
 
 def _size_category(images: int) -> str:
-    """The words of the Hugging Face hub."""
-    steps = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"))
-    return next((name for most, name in steps if images < most), "n>10M")
+    return next((name for limit, name in SIZE_CATEGORIES if images < limit), "n>10M")

@@ -1,4 +1,4 @@
-"""The dataset folder: manifest, digests, and reading all its shards as one dataset."""
+"""Dataset folders: the manifest, its digests, and all shards read as one dataset."""
 
 from __future__ import annotations
 
@@ -14,20 +14,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import SCHEMA, _reading, canonical_json, encode_utf8, open_shard
+from kpbench.dataset.shard import DATASET_SCHEMA, canonical_json, encode_utf8, open_shard, shard_errors
 from kpbench.errors import DataError
 from kpbench.files import folder_at, sha256_of, write_atomic
 from kpbench.types import Truth, UInt8
 
 MANIFEST = "dataset.json"
-
-
-MOST_OPEN = 128  # shards that are open at a time; a process may often have no more than 256 files
+MOST_OPEN_SHARDS = 128
+"""Most shards that a dataset keeps open; a process may often open no more than 256 files."""
 
 
 @dataclass(frozen=True)
 class ShardEntry:
-    """One shard as the manifest lists it: images ``first`` to ``first + count - 1`` of the dataset."""
+    """One shard as the manifest lists it.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file in the dataset's folder.
+    first, count : int
+        The shard holds the images ``first`` to ``first + count - 1`` of the dataset.
+    bytes : int
+        Size of the file.
+    sha256 : str
+        SHA-256 of the file.
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> [shard.file for shard in open_dataset("kpbench-data").shards]
+    ['shard-00000.h5']
+    """
 
     file: str
     first: int
@@ -36,8 +53,8 @@ class ShardEntry:
     sha256: str
 
 
-def fingerprint(config: Mapping[str, Any], shards: Sequence[ShardEntry]) -> str:
-    """SHA-256 over the config and the digests of all shards."""
+def compute_fingerprint(config: Mapping[str, Any], shards: Sequence[ShardEntry]) -> str:
+    """Return the SHA-256 over the config and the digests of all shards."""
     lines = [canonical_json(config), *(shard.sha256 for shard in shards)]
     return hashlib.sha256(encode_utf8("\n".join(lines))).hexdigest()
 
@@ -45,24 +62,24 @@ def fingerprint(config: Mapping[str, Any], shards: Sequence[ShardEntry]) -> str:
 def write_manifest(
     folder: Path, config: Mapping[str, Any], shards: Sequence[ShardEntry], provenance: Mapping[str, Any]
 ) -> str:
-    """Write ``dataset.json``, which makes the folder a finished dataset; return its fingerprint."""
-    mark = fingerprint(config, shards)
+    """Write ``dataset.json``, which makes the folder a finished dataset; return the dataset's fingerprint."""
+    fingerprint = compute_fingerprint(config, shards)
     content = {
-        "schema": SCHEMA,
+        "schema": DATASET_SCHEMA,
         "version": 1,
-        "fingerprint": mark,
+        "fingerprint": fingerprint,
         "seed": config.get("seed"),
         "images": sum(shard.count for shard in shards),
-        "config": json.loads(canonical_json(config)),  # in one order of keys
+        "config": json.loads(canonical_json(config)),  # keys in sorted order, whatever their order in ``config``
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }
     write_atomic(folder / MANIFEST, encode_utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
-    return mark
+    return fingerprint
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of every shard by the manifest; nothing if there is no manifest, or none that can be read."""
+    """Return the SHA-256 of every shard as the manifest records it; empty without a readable manifest."""
     try:
         shards = json.loads((folder / MANIFEST).read_text("utf-8"))["shards"]
         return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
@@ -71,18 +88,29 @@ def recorded_digests(folder: Path) -> dict[str, str]:
 
 
 class Dataset:
-    """A finished dataset folder, read lazily; made by :func:`open_dataset`.
+    """A finished dataset, read lazily; :func:`open_dataset` makes it.
 
-    It can be pickled and used after a fork: file handles belong to the process that opened them.
+    ``dataset[n]`` is the pair of image n and its true keypoints, so that a torch DataLoader can take the dataset.
+    A dataset can be pickled and used after a fork.
 
     Attributes
     ----------
     path : Path
     config : dict
-        What the images are a function of, together with the backgrounds.
+        The configuration that, together with the background files, determined the images.
     fingerprint : str
         SHA-256 over config and shards.
+    provenance : dict
+        Versions of the software that made the images, and background files that could not be decoded.
     shards : tuple of ShardEntry
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> dataset = open_dataset("kpbench-data")
+    >>> image, keypoints = dataset[0]
+    >>> image.shape, keypoints.dtype.names[:3]
+    ((480, 640), ('x', 'y', 'patch_id'))
     """
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
@@ -103,106 +131,106 @@ class Dataset:
         state.pop("truth", None)
         return state
 
-    def _shard(self, n: int) -> Any:
-        if self._process != os.getpid():
+    def _open(self, n: int) -> Any:
+        """Return the open file of shard n; the shard that was used longest ago is closed when there are too many."""
+        if self._process != os.getpid():  # after a fork: open files belong to the parent
             self._files, self._process = {}, os.getpid()
         name = self.shards[n].file
         file = self._files.pop(name, None) or open_shard(self.path / name)
-        if len(self._files) == MOST_OPEN:
+        if len(self._files) == MOST_OPEN_SHARDS:
             self._files.pop(next(iter(self._files))).close()
-        self._files[name] = file  # last, as the one used last
+        self._files[name] = file  # at the end of the dict: used last
         return file
 
     def _locate(self, index: int) -> tuple[Any, int, Path]:
+        """Return the open file that holds an image, the image's row in the file, and the file's path."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path} has {len(self)} images, there is no index {index}")
         n = int(np.searchsorted(self._starts, index, side="right")) - 1
-        return self._shard(n), index - self.shards[n].first, self.path / self.shards[n].file
+        return self._open(n), index - self.shards[n].first, self.path / self.shards[n].file
 
     def image(self, index: int) -> UInt8:
-        """The image at a position (not image id), (H, W) or (H, W, 3) uint8."""
+        """Return the image at a position (not image id), (H, W) or (H, W, 3) uint8."""
         file, row, path = self._locate(index)
-        with _reading(path):
+        with shard_errors(path):
             return np.asarray(file["images"][row])
 
     def keypoints(self, index: int) -> NDArray[Any]:
-        """True keypoints of one image, a :data:`KEYPOINT_DTYPE` table."""
+        """Return the true keypoints of the image at a position, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
         file, row, path = self._locate(index)
-        with _reading(path):
+        with shard_errors(path):
             low, high = file["offsets"][row : row + 2]
             return np.asarray(file["keypoints"][low:high])
 
     def effects(self, index: int) -> list[dict[str, Any]]:
-        """The degradations applied to one image, in order, with their parameters."""
+        """Return the records of the effects that degraded the image at a position, in order."""
         file, row, path = self._locate(index)
-        with _reading(path):
+        with shard_errors(path):
             return list(json.loads(file["degradations"].asstr()[row]))
 
     def __getitem__(self, index: int) -> tuple[UInt8, NDArray[Any]]:
-        """(image, keypoints), so that a torch DataLoader can take the dataset as it is."""
         return self.image(index), self.keypoints(index)
 
-    def _parts(self, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-        """Whole columns of one shard after the other."""
+    def _read_columns(self, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
+        """Yield whole columns of one shard after the other."""
         for n, shard in enumerate(self.shards):
-            with _reading(self.path / shard.file):
-                found = [self._shard(n)[name] for name in names]
-                yield [data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:] for data in found]
+            with shard_errors(self.path / shard.file):
+                columns = [self._open(n)[name] for name in names]
+                yield [data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:] for data in columns]
 
     @cached_property
     def truth(self) -> Truth:
         """All true keypoints as one table."""
         names = ("image_id", "keypoints", "condition", "rung", "scene_id")
-        offsets, *columns = zip(*self._parts(("offsets", *names)), strict=True)
+        offsets, *columns = zip(*self._read_columns(("offsets", *names)), strict=True)
         counts = np.concatenate([np.diff(part) for part in offsets])
         whole = dict(zip(names, map(np.concatenate, columns), strict=True))
         return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]), fingerprint=self.fingerprint)
 
     def verify(self) -> Iterator[ShardEntry]:
-        """Check every shard against the manifest, yielding each one that is whole.
+        """Check every shard against the manifest; yield each shard that is undamaged.
 
         Raises
         ------
         DataError
             At the first shard that is missing, differs in a byte, or cannot be read.
         """
-        if fingerprint(self.config, self.shards) != self.fingerprint:
+        if compute_fingerprint(self.config, self.shards) != self.fingerprint:
             raise DataError(f"{self.path / MANIFEST}: its fingerprint does not fit its config and shards")
         for shard in self.shards:
             path = self.path / shard.file
-            found = sha256_of(path)
-            if found != shard.sha256:
-                raise DataError(f"{path}: damaged, SHA-256 is {found[:12]}…, expected {shard.sha256[:12]}…")
+            digest = sha256_of(path)
+            if digest != shard.sha256:
+                raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
             open_shard(path).close()
             yield shard
 
 
 def open_dataset(path: str | Path) -> Dataset:
-    """Open a finished dataset folder, of this machine or at a URL that fsspec reaches.
+    """Open a finished dataset.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder, or a URL that fsspec reaches, such as ``s3://bucket/name``.
+
+    Returns
+    -------
+    Dataset
 
     Raises
     ------
     DataError
-        If there is none, if its run was not finished, or if a shard is missing or of the wrong size.
+        If there is no dataset, its run was not finished, or a shard is missing or has the wrong size.
+
+    Examples
+    --------
+    >>> from kpbench import open_dataset
+    >>> len(open_dataset("kpbench-data"))
+    6
     """
     folder = folder_at(path)
-    try:
-        manifest = json.loads((folder / MANIFEST).read_text("utf-8"))
-        if manifest["schema"] != SCHEMA:
-            raise DataError(f"{folder / MANIFEST}: schema is {manifest['schema']!r}, expected {SCHEMA!r}")
-        dataset = Dataset(folder, manifest)
-    except FileNotFoundError:
-        if any(folder.glob("shard-*.h5")):
-            raise DataError(f"{folder}: an unfinished dataset (no {MANIFEST}); finish it with --resume") from None
-        raise DataError(f"{folder}: no dataset there (no {MANIFEST}); `kpbench synth` makes one") from None
-    except NotADirectoryError:
-        raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
-    except OSError as error:
-        raise DataError(f"{folder / MANIFEST}: cannot be read, {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
-        raise DataError(
-            f"{folder / MANIFEST}: not a dataset manifest, expected JSON with schema, config, fingerprint and shards"
-        ) from None
+    dataset = _read_manifest(folder)
     if not dataset.shards:
         raise DataError(f"{folder / MANIFEST}: lists no shards")
     for shard in dataset.shards:
@@ -215,3 +243,24 @@ def open_dataset(path: str | Path) -> Dataset:
         if size != shard.bytes:
             raise DataError(f"{folder / shard.file}: damaged, has {size} bytes, expected {shard.bytes}")
     return dataset
+
+
+def _read_manifest(folder: Path) -> Dataset:
+    """Return the dataset that the manifest of a folder describes; its shards are not looked at."""
+    manifest = folder / MANIFEST
+    try:
+        content = json.loads(manifest.read_text("utf-8"))
+        if content["schema"] != DATASET_SCHEMA:
+            raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
+        return Dataset(folder, content)
+    except FileNotFoundError:
+        if any(folder.glob("shard-*.h5")):
+            raise DataError(f"{folder}: an unfinished dataset (no {MANIFEST}); resume the run that makes it") from None
+        raise DataError(f"{folder}: no dataset there (no {MANIFEST}); `kpbench synth` makes one") from None
+    except NotADirectoryError:
+        raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
+    except OSError as error:
+        raise DataError(f"{manifest}: cannot be read, {error.strerror}") from None
+    except (ValueError, KeyError, TypeError, AttributeError):
+        expected = "JSON with schema, config, fingerprint and shards"
+        raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None

@@ -1,7 +1,8 @@
-"""Make datasets: plan the shards, keep the finished ones, have the others made, write the manifest last.
+"""Making datasets: plan the shards, keep those that are finished, make the others, write the manifest last.
 
-A shard is a function of (config, its place) and of nothing else, so it does not matter which process makes it, when,
-or in which run: an interrupted run is finished, and parts made elsewhere are put together, by the same rule.
+A shard is a function of the configuration and of the shard's place in the dataset. So it does not matter which
+process makes a shard, when, and in which run. For the same reason an interrupted run can be resumed, and parts
+that were made on several machines can be merged.
 """
 
 from __future__ import annotations
@@ -14,267 +15,306 @@ import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from functools import cache, partial
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
-from kpbench.dataset import card
-from kpbench.dataset.folder import MANIFEST, Dataset, ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.card import write_card
+from kpbench.dataset.config import DatasetConfig
+from kpbench.dataset.folder import Dataset, ShardEntry, open_dataset, write_manifest
 from kpbench.dataset.resume import (
-    Piece,
-    Result,
-    keep_shards,
+    FinishedShard,
+    PlannedShard,
+    add_resume_hint,
+    find_finished_shards,
     lock_folder,
-    naming_folder,
-    read_head,
-    telling_how_to_resume,
+    name_folder_in_errors,
+    plan_shards,
+    prepare_folder,
+    read_shard_head,
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, make_folder, write_atomic
-from kpbench.workers import Progress, run_jobs
-
-
-class Recipe(Protocol):
-    """A dataset's definition: picklable, hashable, and all that its images are a function of."""
-
-    @property
-    def n(self) -> int:
-        """Number of images."""
-        ...
-
-    @property
-    def shard_size(self) -> int:
-        """Images a shard."""
-        ...
-
-    @property
-    def image_bytes(self) -> int:
-        """What one image is expected to take on disk."""
-        ...
-
-    def to_dict(self) -> dict[str, Any]:
-        """The config that is written into the dataset: no path of this machine."""
-        ...
-
-    def scene_id(self, index: int) -> int:
-        """The base scene of an image; shards are made scene by scene, as what a scene needs is kept."""
-        ...
-
-    def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
-        """One image, and the broken background files met on the way."""
-        ...
-
-    def __hash__(self) -> int: ...
+from kpbench.workers import Progress, dask_executor, run_jobs
 
 
 @dataclass(frozen=True)
-class Run:
-    """What :func:`generate` did: the dataset, the broken background files, and the number of images that were kept."""
+class GenerationResult:
+    """The result of :func:`generate`.
+
+    Attributes
+    ----------
+    dataset : Dataset
+    broken_files : tuple of str
+        Background files that could not be decoded; other files were taken in their place.
+    kept : int
+        Number of images that an earlier run had made.
+
+    Examples
+    --------
+    >>> from kpbench import SynthConfig, generate
+    >>> result = generate(SynthConfig(n=2, size_px=(64, 64)), "two", workers=1)
+    >>> result.kept, result.broken_files
+    (0, ())
+    """
 
     dataset: Dataset
-    broken: tuple[str, ...]
+    broken_files: tuple[str, ...]
     kept: int
 
 
 def generate(
-    config: Recipe,
+    config: DatasetConfig,
     out: str | Path,
     *,
     workers: int | None = None,
     executor: Executor | None = None,
+    scheduler: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = lambda images: None,
-) -> Run:
-    """Write a dataset into a folder.
+) -> GenerationResult:
+    """Make a dataset.
 
     Parameters
     ----------
-    config : Recipe
-        :class:`kpbench.synth.SynthConfig` or :class:`kpbench.synth.SuiteConfig`.
-    out : folder, made if it is not there; or a URL that fsspec reaches, such as ``s3://bucket/name``.
-    workers : processes; None for one a core. 1 works in this process.
-    executor : where the shards are made instead, see :func:`kpbench.workers.run_jobs`; what runs there has to see
-        the folder and the backgrounds under the same paths.
-    resume : keep the finished shards of an interrupted run and make the rest.
-    overwrite : delete the dataset that is in the folder first.
-    progress : called as images are finished.
+    config : SynthConfig or SuiteConfig
+        Or any other :class:`kpbench.dataset.DatasetConfig`.
+    out : str or Path
+        Folder; made if missing. Or a URL that fsspec reaches, such as ``s3://bucket/name``.
+    workers : int or None
+        Number of worker processes, None for one per core. With 1, this process makes all shards.
+    executor : concurrent.futures.Executor, optional
+        Makes the shards in place of worker processes. The folder and the backgrounds must have the same paths there.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers make the shards.
+    resume : bool
+        Keep the finished shards of an interrupted run, and make the others.
+    overwrite : bool
+        First delete the dataset that is in the folder.
+    progress : callable
+        Called with the number of images finished since its last call.
+
+    Returns
+    -------
+    GenerationResult
 
     Raises
     ------
     DataError
-        If the folder holds another dataset or other files, another run is writing to it, the disk is full, or a
-        worker dies; finished shards stay, and the message says how to go on.
+        If the folder holds another dataset or other files, another run is writing to it, the disk is full, or a worker
+        dies. Finished shards stay, and the message says how to resume.
+
+    Examples
+    --------
+    >>> from kpbench import SynthConfig, generate
+    >>> dataset = generate(SynthConfig(n=2, size_px=(64, 64)), "two", workers=1).dataset
+    >>> len(dataset), dataset.image(0).shape
+    (2, (64, 64))
     """
-    folder, written = make_folder(folder_at(out)), config.to_dict()  # lists the backgrounds, before anything is touched
-    plan = _plan(config.n, config.shard_size)
-    with lock_folder(folder):
-        kept = _prepare(folder, written, plan, resume, overwrite)
-        results = _complete(config, folder, written, plan, kept, workers, executor, progress)
-        dataset, broken = _finish(folder, written, [results[name] for name, _, _ in plan])
-    return Run(dataset, broken, sum(entry.count for entry, _ in kept.values()))
+    with _open_executor(executor, scheduler) as executor:
+        folder, written = make_folder(folder_at(out)), config.to_dict()
+        plan = plan_shards(config.n, config.shard_size)
+        run = _Run(config, folder, written, plan, workers, executor, progress)
+        with lock_folder(folder):
+            kept = prepare_folder(folder, written, plan, resume, overwrite)
+            finished = _make_missing_shards(run, kept)
+            dataset, broken_files = _finish_dataset(folder, written, [finished[shard.file] for shard in plan])
+    return GenerationResult(dataset, broken_files, sum(shard.entry.count for shard in kept.values()))
 
 
 def generate_part(
-    config: Recipe,
+    config: DatasetConfig,
     out: str | Path,
     shards: range,
     *,
     workers: int | None = None,
     executor: Executor | None = None,
+    scheduler: str | None = None,
     resume: bool = False,
     overwrite: bool = False,
     progress: Progress = lambda images: None,
 ) -> int:
-    """Write some of a dataset's shards and no manifest; several such runs may share a folder. See :func:`merge`.
+    """Make some shards of a dataset and no manifest. Several such runs may share a folder; see :func:`merge`.
 
     Parameters
     ----------
     shards : range
-        Places of the shards to make, of all that :func:`generate` would make.
-
-    The others, and the errors, are those of :func:`generate`.
+        The shards to make, counted from 0.
+    config, out, workers, executor, scheduler, resume, overwrite, progress
+        See :func:`generate`.
 
     Returns
     -------
     int
-        Number of images that are finished now.
-    """
-    folder, written = make_folder(folder_at(out)), config.to_dict()
-    plan = _plan(config.n, config.shard_size)
-    if not (0 <= shards.start < shards.stop <= len(plan)):
-        asked = f"{shards.start}:{shards.stop}"
-        raise DataError(f"--shard-range is {asked}, expected A:B with 0 <= A < B <= {len(plan)}, the number of shards")
-    part = plan[shards.start : shards.stop]
-    with lock_folder(folder, shared=True):
-        kept = _prepare(folder, written, part, resume, overwrite)
-        results = _complete(config, folder, written, part, kept, workers, executor, progress)
-    return sum(entry.count for entry, _ in results.values())
-
-
-def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
-    """Make one dataset of shards that were made in parts: check that all are there, write the manifest.
-
-    Parameters
-    ----------
-    out : the folder of the dataset; it may hold shards already.
-    parts : folders whose shards are linked or copied into it.
+        Number of finished images in these shards.
 
     Raises
     ------
     DataError
-        If a shard is missing, damaged, or of another dataset than the first.
+        As :func:`generate`; or if the dataset has no such shards.
+
+    Examples
+    --------
+    >>> from kpbench import SynthConfig, merge
+    >>> from kpbench.dataset import generate_part
+    >>> config = SynthConfig(n=4, size_px=(64, 64), shard_size=2)
+    >>> [generate_part(config, "four", range(n, n + 1), workers=1) for n in range(2)]
+    [2, 2]
+    >>> len(merge("four"))
+    4
+    """
+    plan = plan_shards(config.n, config.shard_size)
+    if not (0 <= shards.start < shards.stop <= len(plan)):
+        asked, expected = f"{shards.start}:{shards.stop}", f"A:B with 0 <= A < B <= {len(plan)}"
+        raise DataError(f"`shards` is {asked}, expected {expected}, the number of shards")
+    part = plan[shards.start : shards.stop]
+    with _open_executor(executor, scheduler) as executor:
+        folder, written = make_folder(folder_at(out)), config.to_dict()
+        run = _Run(config, folder, written, part, workers, executor, progress)
+        with lock_folder(folder, shared=True):
+            kept = prepare_folder(folder, written, part, resume, overwrite)
+            finished = _make_missing_shards(run, kept)
+    return sum(shard.entry.count for shard in finished.values())
+
+
+def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
+    """Make one dataset of shards that were made in parts.
+
+    Parameters
+    ----------
+    out : str or Path
+        Folder of the dataset; it may hold shards already.
+    parts : sequence of (str or Path)
+        Folders whose shards are linked or copied into ``out``.
+
+    Returns
+    -------
+    Dataset
+
+    Raises
+    ------
+    DataError
+        If a shard is missing, damaged, or of another dataset than the first shard.
+
+    Examples
+    --------
+    See :func:`kpbench.dataset.generate_part`.
+
+    >>> from kpbench import SynthConfig, merge
+    >>> from kpbench.dataset import generate_part
+    >>> generate_part(SynthConfig(n=2, size_px=(64, 64)), "part", range(1), workers=1)
+    2
+    >>> len(merge("whole", ["part"]))
+    2
     """
     folder = make_folder(folder_at(out))
     with lock_folder(folder):
         for part in map(folder_at, parts):
             for path in sorted(part.glob("shard-*.h5")):
                 if not (folder / path.name).exists():
-                    _bring(path, folder / path.name)
+                    _link_or_copy(path, folder / path.name)
         present = sorted(folder.glob("shard-*.h5"))
         if not present:
-            raise DataError(f"{folder}: no shards there; name the folders of the parts")
-        written = json.loads(read_head(present[0])[0])
-        plan = _plan(written["n"], written["shard_size"])
-        missing = [n for n, (name, _, _) in enumerate(plan) if not (folder / name).exists()]
+            raise DataError(f"{folder}: no shards there; name the folders of the `parts`")
+        written = json.loads(read_shard_head(present[0]).config)
+        plan = plan_shards(written["n"], written["shard_size"])
+        missing = [n for n, shard in enumerate(plan) if not (folder / shard.file).exists()]
         if missing:
             raise DataError(f"{folder}: {len(missing)} of {len(plan)} shards are missing, first is number {missing[0]}")
-        kept = keep_shards(folder, written, plan)
-        return _finish(folder, written, [kept[name] for name, _, _ in plan])[0]
+        finished = find_finished_shards(folder, written, plan)
+        return _finish_dataset(folder, written, [finished[shard.file] for shard in plan])[0]
 
 
-def _bring(source: Path, target: Path) -> None:
-    """A second name for a file, or a copy of it where the file system has no such names."""
+def _link_or_copy(source: Path, target: Path) -> None:
+    """Make a hard link to a file, or a copy of the file where the file system has no hard links."""
     try:
         os.link(source, target)
     except OSError:
         write_atomic(target, source.read_bytes())
 
 
-def _plan(n: int, shard_size: int) -> list[Piece]:
-    firsts = range(0, n, shard_size)
-    return [(f"shard-{k:05d}.h5", first, min(shard_size, n - first)) for k, first in enumerate(firsts)]
+def _open_executor(executor: Executor | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
+    """Connect to a Dask scheduler if there is an address; otherwise pass the executor on."""
+    return nullcontext(executor) if scheduler is None else dask_executor(scheduler)
 
 
-def _prepare(
-    folder: Path, written: dict[str, Any], plan: list[Piece], resume: bool, overwrite: bool
-) -> dict[str, Result]:
-    """Look at what the folder holds; return the finished shards of the plan that this run can keep."""
-    manifest = folder / MANIFEST
-    there = [path for path in folder.glob("*") if not path.name.startswith(".")]
-    present = [path for path in there if fnmatch(path.name, "shard-*.h5")]
-    names = {name for name, _, _ in plan}
-    mine = [path for path in present if path.name in names]
-    if there and not present and not manifest.exists():
-        raise DataError(f"{folder}: holds other files ({there[0].name}, ...), expected a new or an empty folder")
-    if overwrite:
-        whole = plan[0][1] == 0 and len(plan) * plan[0][2] >= written["n"]
-        for path in [manifest, *(folder / name for name in card.FILES), *(present if whole else mine)]:
-            path.unlink(missing_ok=True)
-    elif not resume and (manifest.exists() or mine):
-        what = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
-        raise DataError(f"{folder}: {what}; add --resume to finish it, --overwrite to replace it, or another --out")
-    for name in names:
-        for leftover in folder.glob(f".{name}.*.part"):  # of a run that was killed while it wrote
-            leftover.unlink(missing_ok=True)
-    if overwrite or not resume:
-        return {}
-    if present and len(plan) != len(_plan(written["n"], written["shard_size"])):
-        present = mine
-    for path in present:
-        if path.name not in names:
-            raise DataError(f"{path}: of another dataset than this command makes; use --overwrite or another --out")
-    return keep_shards(folder, written, plan)
+@dataclass(frozen=True)
+class _Run:
+    """One call of :func:`generate` or :func:`generate_part`.
+
+    Attributes
+    ----------
+    config : DatasetConfig
+    folder : Path
+    written : dict
+        The config as it is written into the dataset.
+    plan : list of PlannedShard
+        The shards that this run makes.
+    workers, executor, progress
+        See :func:`generate`.
+    """
+
+    config: DatasetConfig
+    folder: Path
+    written: dict[str, Any]
+    plan: list[PlannedShard]
+    workers: int | None
+    executor: Executor | None
+    progress: Progress
 
 
-def _complete(
-    config: Recipe,
-    folder: Path,
-    written: dict[str, Any],
-    plan: list[Piece],
-    kept: dict[str, Result],
-    workers: int | None,
-    executor: Executor | None,
-    progress: Progress,
-) -> dict[str, Result]:
-    """Have the shards of a plan made that are not there yet."""
-    todo = sorted((piece for piece in plan if piece[0] not in kept), key=lambda piece: config.scene_id(piece[1]))
-    _check_space(folder, config.image_bytes, sum(count for _, _, count in todo))
-    progress(sum(entry.count for entry, _ in kept.values()))
-    results = dict(kept)
-    work = partial(_write_shard, config, written, folder.resolve())
-    with telling_how_to_resume(folder):
-        for entry, met in run_jobs(work, todo, workers, progress, executor):
-            results[entry.file] = (entry, met)
-    return results
+def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str, FinishedShard]:
+    """Make the planned shards that are not kept; return all planned shards by their file names."""
+    missing = [shard for shard in run.plan if shard.file not in kept]
+    missing.sort(key=lambda shard: run.config.scene_id(shard.first))
+    _check_space(run.folder, run.config.image_bytes, sum(shard.count for shard in missing))
+    run.progress(sum(shard.entry.count for shard in kept.values()))
+    finished = dict(kept)
+    work = partial(_make_shard, run.config, run.written, run.folder.resolve())
+    with add_resume_hint(run.folder):
+        for shard in run_jobs(work, missing, run.workers, run.progress, run.executor):
+            finished[shard.entry.file] = shard
+    return finished
 
 
-def _finish(folder: Path, written: dict[str, Any], results: list[Result]) -> tuple[Dataset, tuple[str, ...]]:
-    """Write the manifest, which makes the folder a dataset, and its card."""
-    broken = tuple(sorted({file for _, files in results for file in files}))
-    with naming_folder(folder):
-        write_manifest(folder, written, [entry for entry, _ in results], _provenance(broken))
+def _finish_dataset(
+    folder: Path, written: dict[str, Any], shards: list[FinishedShard]
+) -> tuple[Dataset, tuple[str, ...]]:
+    """Write the manifest, which makes the folder a dataset, and the dataset's card.
+
+    Returns
+    -------
+    dataset : Dataset
+    broken_files : tuple of str
+        Background files that could not be decoded.
+    """
+    broken_files = tuple(sorted({file for shard in shards for file in shard.broken_files}))
+    with name_folder_in_errors(folder):
+        write_manifest(folder, written, [shard.entry for shard in shards], _provenance(broken_files))
         dataset = open_dataset(folder)
-        card.write_card(dataset, folder)
-    return dataset, broken
+        write_card(dataset, folder)
+    return dataset, broken_files
 
 
 def _check_space(folder: Path, image_bytes: int, images: int) -> None:
-    """Refuse to start what cannot end."""
+    """Raise an error if the disk has too little space for the images."""
     if not is_local(folder):
         return
-    need = images * image_bytes
+    needed = images * image_bytes
     free = shutil.disk_usage(folder).free
-    if need > free:
-        raise DataError(f"{folder}: {images} images need about {_size(need)}, the disk has {_size(free)} free")
+    if needed > free:
+        raise DataError(
+            f"{folder}: {images} images need about {_format_bytes(needed)}, the disk has {_format_bytes(free)} free"
+        )
 
 
-def _size(count: float) -> str:
-    """Bytes for people: 12.3 MB."""
+def _format_bytes(count: float) -> str:
+    """Return a number of bytes for people, such as 12.3 MB."""
     for unit in ("B", "kB", "MB", "GB", "TB"):
         if count < 1000 or unit == "TB":
             break
@@ -282,40 +322,44 @@ def _size(count: float) -> str:
     return f"{count:.3g} {unit}"
 
 
-def _provenance(broken: tuple[str, ...]) -> dict[str, Any]:
-    """Versions that can change pixels, and the broken files; nothing that differs between equal runs."""
+def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:
+    """Return the versions that can change pixels, and the broken files; equal runs give equal provenance."""
     libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "deflate")
     return {
         "versions": {
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in libraries},
         },
-        "broken_backgrounds": list(broken),
+        "broken_backgrounds": list(broken_files),
     }
 
 
-_turn = threading.Lock()
+_one_shard_at_a_time = threading.Lock()
+"""An executor may run several threads in one process, but caches and albumentations' generators are not thread-safe."""
 
 
-def _write_shard(config: Recipe, written: dict[str, Any], folder: Path, piece: Piece, progress: Progress) -> Result:
-    name, first, count = piece
-    met: set[str] = set()
+def _make_shard(
+    config: DatasetConfig, written: dict[str, Any], folder: Path, shard: PlannedShard, progress: Progress
+) -> FinishedShard:
+    """Make one shard and write it into the folder."""
+    broken_files: set[str] = set()
 
-    def made() -> Iterator[Sample]:
-        ours = _of_this_process(config)
-        for index in range(first, first + count):
-            sample, failed = ours.make(index)
-            met.update(failed)
+    def make_samples() -> Iterator[Sample]:
+        cached_config = _config_of_process(config)
+        for index in range(shard.first, shard.first + shard.count):
+            sample, broken = cached_config.make(index)
+            broken_files.update(broken)
             yield sample
             progress(1)
 
-    with _turn:  # an executor may have several threads a process; caches and albumentations' generators are not theirs
-        data = encode_shard(made(), count, written, met)
-    write_atomic(folder / name, data)
-    return ShardEntry(name, first, count, len(data), hashlib.sha256(data).hexdigest()), tuple(sorted(met))
+    with _one_shard_at_a_time:
+        data = encode_shard(make_samples(), shard.count, written, broken_files)
+    write_atomic(folder / shard.file, data)
+    entry = ShardEntry(shard.file, shard.first, shard.count, len(data), hashlib.sha256(data).hexdigest())
+    return FinishedShard(entry, tuple(sorted(broken_files)))
 
 
 @cache
-def _of_this_process(config: Recipe) -> Recipe:
-    """One config object a process, so that the decoded photographs are cached across shards."""
+def _config_of_process(config: DatasetConfig) -> DatasetConfig:
+    """Return one config object per process, so that all shards share its cache of decoded photographs."""
     return config

@@ -1,98 +1,222 @@
-"""What an earlier run left: which shards stay, what differs, and who else is writing."""
+"""Resuming a run: which shards of an earlier run are kept, and the lock against a second run."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from kpbench.dataset.folder import ShardEntry, recorded_digests
-from kpbench.dataset.shard import attribute, canonical_json, open_shard
+from kpbench.dataset.card import CARD_FILES
+from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
+from kpbench.dataset.shard import canonical_json, open_shard, read_text_attribute
 from kpbench.errors import DataError
 from kpbench.files import is_local, sha256_of
 
-LOCK = ".kpbench.lock"
+LOCK_FILE = ".kpbench.lock"
+LONGEST_VALUE = 40
+"""Longest text of a config's value that an error message shows."""
+REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
+"""What a user can do about a folder that holds another dataset."""
 
 
-def keep_shards(folder: Path, written: dict[str, Any], plan: list[Piece]) -> dict[str, Result]:
-    """Those shards of a plan that are there, after a look into each; if the dataset was finished, byte by byte."""
-    known = recorded_digests(folder)
-    kept: dict[str, Result] = {}
-    for name, first, count in plan:
-        path = folder / name
-        if path.exists():
-            config, broken, images = read_head(path)
-            if config != canonical_json(written) or images != range(first, first + count):
-                why = first_difference(json.loads(config), written)
-                raise DataError(
-                    f"{path}: of another dataset than this command makes{why}; use --overwrite or another --out"
-                )
-            entry = ShardEntry(name, first, count, path.stat().st_size, sha256_of(path))
-            if known.get(name, entry.sha256) != entry.sha256:
-                raise DataError(f"{path}: damaged since it was written; delete it, and --resume makes it again")
-            kept[name] = (entry, broken)
-    return kept
+@dataclass(frozen=True)
+class PlannedShard:
+    """A shard to make: its file name, its first image, and its number of images."""
+
+    file: str
+    first: int
+    count: int
 
 
-def read_head(path: Path) -> tuple[str, tuple[str, ...], range]:
-    """A shard's config as text, its broken backgrounds, and which images it holds."""
+@dataclass(frozen=True)
+class FinishedShard:
+    """A finished shard, and the background files that could not be decoded for it."""
+
+    entry: ShardEntry
+    broken_files: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ShardHead:
+    """The dataset that a shard belongs to, and the shard's place in the dataset."""
+
+    config: str
+    broken_files: tuple[str, ...]
+    images: range
+
+
+def plan_shards(n: int, shard_size: int) -> list[PlannedShard]:
+    """List all shards of a dataset of n images."""
+    firsts = range(0, n, shard_size)
+    return [PlannedShard(f"shard-{k:05d}.h5", first, min(shard_size, n - first)) for k, first in enumerate(firsts)]
+
+
+def prepare_folder(
+    folder: Path, config: dict[str, Any], plan: Sequence[PlannedShard], resume: bool, overwrite: bool
+) -> dict[str, FinishedShard]:
+    """Check what a folder holds, delete what a run replaces, and return the finished shards that the run keeps.
+
+    Parameters
+    ----------
+    folder : Path
+    config : dict
+        Config of the dataset.
+    plan : sequence of PlannedShard
+        The shards of the run: all shards of the dataset, or a part.
+    resume, overwrite : bool
+        See :func:`kpbench.generate`.
+
+    Returns
+    -------
+    dict
+        The finished shards by their file names.
+
+    Raises
+    ------
+    DataError
+        If the folder holds other files; if it holds shards and neither ``resume`` nor ``overwrite`` is set; or as
+        :func:`find_finished_shards`.
+    """
+    manifest, names = folder / MANIFEST, {shard.file for shard in plan}
+    entries = [path for path in folder.glob("*") if not path.name.startswith(".")]
+    present = [path for path in entries if fnmatch(path.name, "shard-*.h5")]
+    if entries and not present and not manifest.exists():
+        raise DataError(f"{folder}: holds other files ({entries[0].name}, ...), expected a new or an empty folder")
+    planned = [path for path in present if path.name in names]
+    is_whole = len(plan) == len(plan_shards(config["n"], config["shard_size"]))
+    concerned = present if is_whole else planned
+    if overwrite:
+        for path in [manifest, *(folder / name for name in CARD_FILES), *concerned]:
+            path.unlink(missing_ok=True)
+    elif not resume and (manifest.exists() or planned):
+        problem = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
+        remedy = "add `resume=True` to finish it, `overwrite=True` to replace it, or another `out`"
+        raise DataError(f"{folder}: {problem}; {remedy}")
+    for name in names:
+        for leftover in folder.glob(f".{name}.*.part"):  # of a run that was killed while it wrote
+            leftover.unlink(missing_ok=True)
+    if overwrite or not resume:
+        return {}
+    for path in concerned:
+        if path.name not in names:
+            raise DataError(f"{path}: of another dataset{REMEDY}")
+    return find_finished_shards(folder, config, plan, REMEDY)
+
+
+def find_finished_shards(
+    folder: Path, config: dict[str, Any], plan: Sequence[PlannedShard], remedy: str = ""
+) -> dict[str, FinishedShard]:
+    """Find the shards of a plan that are in a folder, and check each.
+
+    Parameters
+    ----------
+    folder : Path
+    config : dict
+        Config of the dataset.
+    plan : sequence of PlannedShard
+    remedy : str
+        End of the message about a shard of another dataset.
+
+    Returns
+    -------
+    dict
+        The finished shards by their file names.
+
+    Raises
+    ------
+    DataError
+        If a shard belongs to another dataset or holds other images, or is damaged. Damage of pixels is found only if
+        the folder has a manifest, which records the digest of each shard.
+    """
+    digests = recorded_digests(folder)
+    finished: dict[str, FinishedShard] = {}
+    for planned in plan:
+        path = folder / planned.file
+        if not path.exists():
+            continue
+        head = read_shard_head(path)
+        if head.config != canonical_json(config) or head.images != range(planned.first, planned.first + planned.count):
+            difference = first_difference(json.loads(head.config), config)
+            raise DataError(f"{path}: of another dataset{difference}{remedy}")
+        entry = ShardEntry(planned.file, planned.first, planned.count, path.stat().st_size, sha256_of(path))
+        if digests.get(planned.file, entry.sha256) != entry.sha256:
+            raise DataError(f"{path}: damaged since it was written; delete it, and resume the run that makes it")
+        finished[planned.file] = FinishedShard(entry, head.broken_files)
+    return finished
+
+
+def read_shard_head(path: Path) -> ShardHead:
+    """Open a shard and read the dataset's config (as text) and the shard's place in the dataset."""
     with open_shard(path) as file:
         ids = file["image_id"][:]
-        broken = tuple(json.loads(attribute(file, "broken_backgrounds")))
-        return attribute(file, "config"), broken, range(int(ids[0]), int(ids[-1]) + 1)
+        broken_files = tuple(json.loads(read_text_attribute(file, "broken_backgrounds")))
+        return ShardHead(read_text_attribute(file, "config"), broken_files, range(int(ids[0]), int(ids[-1]) + 1))
 
 
-def first_difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """The first option in which two configs differ, for people; of a table, the first entry."""
-    for key in here:
-        if there.get(key) != here[key]:
-            if isinstance(there.get(key), dict) and isinstance(here[key], dict):
-                return first_difference(there[key], here[key])
-            values = [str(config.get(key)) for config in (there, here)]
-            said = f" is {values[0]} there, {values[1]} here" if max(map(len, values)) < 40 else " differs"
-            return f" ({key}{said})"
+def first_difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
+    """Describe the first key whose value differs between two configs, "" if none does; tables are entered."""
+    for key in expected:
+        if found.get(key) != expected[key]:
+            if isinstance(found.get(key), dict) and isinstance(expected[key], dict):
+                return first_difference(found[key], expected[key])
+            values = [str(config.get(key)) for config in (found, expected)]
+            is_short = max(map(len, values)) < LONGEST_VALUE
+            return f" ({key} is {values[0]} there, {values[1]} here)" if is_short else f" ({key} differs)"
     return ""
 
 
 @contextmanager
-def naming_folder(folder: Path) -> Iterator[None]:
-    """Let errors name the folder as the user does."""
+def name_folder_in_errors(folder: Path) -> Iterator[None]:
+    """Make errors begin with the folder's name as the user wrote it."""
     try:
         yield
     except DataError as error:
-        said = str(error).replace(str(folder.resolve()), str(folder))
-        raise DataError(said if said.startswith(str(folder)) else f"{folder}: {said}") from None
+        message = str(error).replace(str(folder.resolve()), str(folder))
+        raise DataError(message if message.startswith(str(folder)) else f"{folder}: {message}") from None
 
 
 @contextmanager
-def telling_how_to_resume(folder: Path) -> Iterator[None]:
-    """Let errors say how to go on, too, where something is there to go on from."""
+def add_resume_hint(folder: Path) -> Iterator[None]:
+    """Make errors say how to resume the run, if the folder holds finished shards."""
     try:
-        with naming_folder(folder):
+        with name_folder_in_errors(folder):
             yield
     except DataError as error:
-        kept = "; finished shards are kept, add --resume to go on" if any(folder.glob("shard-*.h5")) else ""
-        raise DataError(f"{error}{kept}") from None
+        has_shards = any(folder.glob("shard-*.h5"))
+        hint = "; finished shards are kept, add `resume=True` to go on" if has_shards else ""
+        raise DataError(f"{error}{hint}") from None
 
 
 @contextmanager
 def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold the folder against another run; the lock ends with the process, however that ends.
+    """Lock a folder against other runs. The lock ends with the process, even if the process is killed.
 
-    Runs of a part of the shards share it with each other.
+    Parameters
+    ----------
+    folder : Path
+        A folder at a URL is not locked: object stores have no locks.
+    shared : bool
+        Let other runs with a shared lock write at the same time, each its own shards.
+
+    Raises
+    ------
+    DataError
+        If another run holds the lock, or the lock's file cannot be written.
     """
     try:
         import fcntl
-    except ImportError:  # Windows has no flock; there the check is left out
+    except ImportError:  # Windows has no flock, so the folder is not locked
         yield
         return
-    if not is_local(folder):  # nor has an object store
+    if not is_local(folder):
         yield
         return
-    path = folder / LOCK
+    path = folder / LOCK_FILE
     try:
         file = path.open("w")
     except OSError as error:
@@ -100,7 +224,7 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # unlinked between open and lock
+            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # deleted between open and flock
                 raise OSError
         except OSError:
             raise DataError(f"{folder}: another kpbench run is writing to it") from None
@@ -109,11 +233,3 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         finally:
             if not shared:
                 path.unlink(missing_ok=True)
-
-
-Piece = tuple[str, int, int]
-"""(file, first image, number of images) of a shard."""
-
-
-Result = tuple[ShardEntry, tuple[str, ...]]
-"""A finished shard, and the background files that could not be decoded for it."""

@@ -1,6 +1,6 @@
-"""Dataset folders: shards written whole or not at all, read lazily, verified byte by byte.
+"""Shards: HDF5 files that hold some images of a dataset and their truth, written whole and checked on reading.
 
-The format is described in ``docs/reference/dataset-format.md``; this is the only module that uses h5py.
+``docs/reference/dataset-format.md`` describes the format.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ from kpbench.errors import DataError
 from kpbench.files import is_local
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
-SCHEMA = "kpbench.dataset/1"
-# libdeflate: the output of ISA-L, zlib-ng and zlib-rs may depend on what else was in memory
-# (docs/reference/dataset-format.md)
+DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
-COLUMNS = (
+"""Level of libdeflate. The output of ISA-L, zlib-ng and zlib-rs may depend on what else is in memory."""
+MOST_INFLATION = 1100
+"""Largest believable ratio of unpacked to packed bytes; deflate reaches 1032 at most."""
+SHARD_COLUMNS = (
     "images",
     "image_id",
     "scene_id",
@@ -37,15 +38,36 @@ COLUMNS = (
     "degradations",
     "background",
 )
-MOST_DEFLATE = 1100  # deflate cannot shrink more than 1032-fold; what declares more is no honest file
 
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled image on its way to a shard.
+    """One labelled image on its way into a shard.
 
-    ``image`` is (H, W) or (H, W, 3) uint8, ``keypoints`` a :data:`KEYPOINT_DTYPE` table, ``effects`` the
-    degradations in order, ``background`` the photograph's path below its folder or "".
+    Attributes
+    ----------
+    image_id : int
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+        Grey or RGB.
+    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
+    effects : list of dict
+        Records of the degradations, in order.
+    background : str
+        Path of the photograph below its folder, "" for a procedural background.
+    condition : str
+        "" if the image belongs to no condition.
+    rung : float
+        nan if the image belongs to no condition.
+    scene_id : int
+        The base scene; images of one scene share it. -1 if the image is a scene of its own.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench import KEYPOINT_DTYPE
+    >>> from kpbench.dataset import Sample
+    >>> Sample(0, np.zeros((48, 64), np.uint8), np.zeros(2, KEYPOINT_DTYPE)).scene_id
+    -1
     """
 
     image_id: int
@@ -59,123 +81,132 @@ class Sample:
 
 
 def canonical_json(content: object) -> str:
-    """JSON with sorted keys and no spaces: equal contents give equal text."""
+    """Return JSON with sorted keys and no spaces, so that equal contents give equal text."""
     return json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
 
 
 def encode_shard(
-    samples: Iterable[Sample], count: int, config: Mapping[str, Any], broken: Collection[str] = ()
+    samples: Iterable[Sample], count: int, config: Mapping[str, Any], broken_files: Collection[str] = ()
 ) -> memoryview:
-    """All bytes of a shard's HDF5 file, built in memory: the same samples give the same bytes.
+    """Build a shard in memory and return its bytes; the same samples give the same bytes.
 
-    Images are packed as they come, so that never more than one is held unpacked.
+    Each image is packed as soon as it is made, so that only one image at a time is in memory unpacked.
 
     Parameters
     ----------
     samples : iterable of Sample
-    count : how many there are.
-    config : the dataset's config.
-    broken : background files that could not be decoded on the way; looked at when all samples are in.
+    count : int
+        Number of samples.
+    config : mapping
+        Config of the dataset.
+    broken_files : collection of str
+        Background files that could not be decoded. It is read after the last sample, so the making of samples may
+        still add to it.
 
     Raises
     ------
     ValueError
-        If there are no samples or their images differ in shape.
+        If there are no samples, or their images differ in shape.
     """
     buffer = io.BytesIO()
-    # v110 file structures carry checksums, so that a flipped byte outside the data is seen on reading. Only the
-    # heap of variable-length strings has none (and HDF5 can loop for ever over a damaged one): text is of fixed length.
-    # Without a chunk cache a column gets its place when it is written; else it gets it when Python frees the h5py
-    # object, which another thread's garbage collection can put off
+    # File structures of v110 carry checksums, so that reading finds a flipped byte outside the data, too. Only the
+    # heap of variable-length strings has no checksum, and HDF5 can loop for ever over a damaged heap: text is
+    # therefore stored in fixed length.
+    # Without a chunk cache, a column gets its place in the file when it is written. With a cache, it gets its place
+    # when Python frees the h5py object, which garbage collection in another thread can delay.
     with h5py.File(buffer, "w", libver=("v110", "v110"), rdcc_nbytes=0) as file:
-        kept = _write_images(file, samples, count)
+        written = _write_images(file, samples, count)
         attributes = {
-            "schema": SCHEMA,
+            "schema": DATASET_SCHEMA,
             "config": canonical_json(config),
-            "broken_backgrounds": canonical_json(sorted(broken)),
+            "broken_backgrounds": canonical_json(sorted(broken_files)),
         }
         for name, text in attributes.items():
-            file.attrs.create(name, encode_utf8(text), dtype=_text_type([encode_utf8(text)]))
+            file.attrs.create(name, encode_utf8(text), dtype=_fixed_text_type([encode_utf8(text)]))
         file.attrs["version"] = 1
 
-        def column(name: str, values: NDArray[Any], **compression: Any) -> None:
-            checked = {"chunks": values.shape, "fletcher32": True, **compression} if values.size else {}
-            file.create_dataset(name, data=values, **checked)
+        def write_column(name: str, values: NDArray[Any], **compression: Any) -> None:
+            options = {"chunks": values.shape, "fletcher32": True, **compression} if values.size else {}
+            file.create_dataset(name, data=values, **options)
 
-        def texts(name: str, values: Sequence[str]) -> None:
-            column(name, _fixed_text(values), compression="gzip", compression_opts=1)
+        def write_texts(name: str, values: Sequence[str]) -> None:
+            write_column(name, _to_fixed_text(values), compression="gzip", compression_opts=1)
 
-        column("image_id", np.array([sample.image_id for sample in kept], "<i8"))
-        column("scene_id", np.array([_scene(sample) for sample in kept], "<i8"))
-        texts("condition", [sample.condition for sample in kept])
-        column("rung", np.array([sample.rung for sample in kept], "<f8"))
-        column("offsets", np.cumsum([0, *(len(sample.keypoints) for sample in kept)], dtype="<i8"))
-        column("keypoints", np.concatenate([sample.keypoints for sample in kept]).astype(KEYPOINT_DTYPE))
-        texts("degradations", [canonical_json(sample.effects) for sample in kept])
-        texts("background", [sample.background for sample in kept])
+        write_column("image_id", np.array([sample.image_id for sample in written], "<i8"))
+        write_column("scene_id", np.array([_scene_id(sample) for sample in written], "<i8"))
+        write_texts("condition", [sample.condition for sample in written])
+        write_column("rung", np.array([sample.rung for sample in written], "<f8"))
+        write_column("offsets", np.cumsum([0, *(len(sample.keypoints) for sample in written)], dtype="<i8"))
+        write_column("keypoints", np.concatenate([sample.keypoints for sample in written]).astype(KEYPOINT_DTYPE))
+        write_texts("degradations", [canonical_json(sample.effects) for sample in written])
+        write_texts("background", [sample.background for sample in written])
     return buffer.getbuffer()
 
 
 def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Sample]:
-    """Write ``/images``, one a chunk; return the samples without their pixels."""
-    kept: list[Sample] = []
+    """Write ``/images``, one image per chunk; return the samples without their pixels."""
+    written: list[Sample] = []
     shape: tuple[int, ...] = ()
     for sample in samples:
-        if not kept:
+        if not written:
             shape = sample.image.shape
-            whole = {"chunks": (1, *shape), "compression": "gzip", "compression_opts": DEFLATE_LEVEL}
-            images = file.create_dataset("images", (count, *shape), "u1", **whole)
+            options = {"chunks": (1, *shape), "compression": "gzip", "compression_opts": DEFLATE_LEVEL}
+            images = file.create_dataset("images", (count, *shape), "u1", **options)
         elif sample.image.shape != shape:
             raise ValueError(f"a shard needs images of one shape, got {shape} and {sample.image.shape}")
         packed = deflate.zlib_compress(np.ascontiguousarray(sample.image), DEFLATE_LEVEL)
-        images.id.write_direct_chunk((len(kept), *(0 for _ in shape)), packed)
-        kept.append(replace(sample, image=sample.image[:0]))
-    if len(kept) != count or not count:
-        raise ValueError(f"a shard of {count} images got {len(kept)}")
-    return kept
+        images.id.write_direct_chunk((len(written), *(0 for _ in shape)), packed)
+        written.append(replace(sample, image=sample.image[:0]))
+    if len(written) != count or not count:
+        raise ValueError(f"a shard of {count} images got {len(written)}")
+    return written
 
 
-def _text_type(packed: Sequence[bytes]) -> Any:
-    """HDF5's type of UTF-8 text of a fixed length that holds all of these."""
-    return h5py.string_dtype("utf-8", max(len(text) for text in [b"-", *packed]))
+def _fixed_text_type(encoded: Sequence[bytes]) -> Any:
+    """Return HDF5's type of UTF-8 text of the length of the longest text."""
+    return h5py.string_dtype("utf-8", max(len(text) for text in [b"-", *encoded]))
 
 
-def _fixed_text(values: Sequence[str]) -> NDArray[Any]:
-    packed = [encode_utf8(value) for value in values]
-    return np.array(packed, _text_type(packed))
+def _to_fixed_text(values: Sequence[str]) -> NDArray[Any]:
+    encoded = [encode_utf8(value) for value in values]
+    return np.array(encoded, _fixed_text_type(encoded))
 
 
-def _scene(sample: Sample) -> int:
+def _scene_id(sample: Sample) -> int:
     return sample.image_id if sample.scene_id < 0 else sample.scene_id
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn whatever h5py raises on a damaged file into one line."""
+def shard_errors(path: Path) -> Iterator[None]:
+    """Turn every error of h5py on a damaged file into one line that names the file."""
     try:
         yield
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
         raise DataError(f"{path}: damaged or no kpbench shard ({' '.join(str(error).split())[:160]})") from None
 
 
-def attribute(file: Any, name: str) -> str:
-    """A text attribute of an open shard."""
+def read_text_attribute(file: Any, name: str) -> str:
+    """Return a text attribute of an open shard."""
     return np.bytes_(file.attrs[name]).decode()
 
 
 def open_shard(path: Path) -> Any:
-    """Open a shard after checking that it is what it says: plain local data of believable size.
+    """Open a shard after checking that it is plain local data of believable size.
+
+    Returns
+    -------
+    h5py.File
 
     Raises
     ------
     DataError
-        If it is damaged, of another schema, or reaches outside itself (external links or storage,
-        virtual datasets, filters that HDF5 does not have built in).
+        If the file is damaged, has another schema, or needs anything outside itself: external links or storage,
+        virtual datasets, filters that are not built into HDF5.
     """
-    with _reading(path):
+    with shard_errors(path):
         file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
-        with _reading(path):
+        with shard_errors(path):
             _check_shard(file, path.stat().st_size)
     except BaseException:
         file.close()
@@ -183,38 +214,45 @@ def open_shard(path: Path) -> Any:
     return file
 
 
-def _check_shard(file: Any, size: int) -> None:
-    schema = attribute(file, "schema")
-    if schema != SCHEMA:
-        raise ValueError(f"schema is {schema!r}, expected {SCHEMA!r}")
-    count = -1
-    for name in COLUMNS:
-        if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-            raise ValueError(f"/{name} is missing or a link to elsewhere")
-        data = file[name]
-        if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.hasobject:
-            raise ValueError(f"/{name} is not plain data stored in this file")
-        plan = data.id.get_create_plist()
-        filters = {plan.get_filter(n)[0] for n in range(plan.get_nfilters())}
-        if not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}:
-            raise ValueError(f"/{name} uses a filter that HDF5 does not have built in")
-        stored = data.id.get_storage_size()
-        if data.nbytes > (MOST_DEFLATE * stored if filters & {h5py.h5z.FILTER_DEFLATE} else min(stored, size)):
-            raise ValueError(f"/{name} declares {data.nbytes} bytes, the file holds {stored} for it")
-        if name == "images":
-            count = data.shape[0]
-            if data.dtype != np.uint8 or data.ndim not in (3, 4):
-                raise ValueError(f"/images is {data.dtype} of shape {data.shape}, expected uint8 (N,H,W) or (N,H,W,3)")
-        elif name == "keypoints":
-            if data.dtype != KEYPOINT_DTYPE:
-                raise ValueError("/keypoints has other columns than this version of kpbench knows")
-        elif data.shape != (count + (name == "offsets"),):
-            raise ValueError(f"/{name} has shape {data.shape}, which does not fit {count} images")
+def _check_shard(file: Any, file_bytes: int) -> None:
+    """Raise ValueError if an open shard is not what :func:`open_shard` accepts."""
+    schema = read_text_attribute(file, "schema")
+    if schema != DATASET_SCHEMA:
+        raise ValueError(f"schema is {schema!r}, expected {DATASET_SCHEMA!r}")
+    for name in SHARD_COLUMNS:
+        _check_storage(file, name, file_bytes)
+    images = file["images"]
+    if images.dtype != np.uint8 or images.ndim not in (3, 4):
+        raise ValueError(f"/images is {images.dtype} of shape {images.shape}, expected uint8 (N,H,W) or (N,H,W,3)")
+    if file["keypoints"].dtype != KEYPOINT_DTYPE:
+        raise ValueError("/keypoints has other columns than this version of kpbench knows")
+    count = images.shape[0]
+    for name in SHARD_COLUMNS:
+        expected = (count + (name == "offsets"),)
+        if name not in ("images", "keypoints") and file[name].shape != expected:
+            raise ValueError(f"/{name} has shape {file[name].shape}, which does not fit {count} images")
     offsets = file["offsets"][:]
     if offsets[0] != 0 or offsets[-1] != len(file["keypoints"]) or np.any(np.diff(offsets) < 0):
         raise ValueError("/offsets does not fit /keypoints")
 
 
+def _check_storage(file: Any, name: str, file_bytes: int) -> None:
+    """Raise ValueError if a column is stored elsewhere, or declares more data than its bytes can hold."""
+    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
+        raise ValueError(f"/{name} is missing or a link to elsewhere")
+    data = file[name]
+    if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.hasobject:
+        raise ValueError(f"/{name} is not plain data stored in this file")
+    creation = data.id.get_create_plist()
+    filters = {creation.get_filter(n)[0] for n in range(creation.get_nfilters())}
+    if not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}:
+        raise ValueError(f"/{name} uses a filter that HDF5 does not have built in")
+    stored = data.id.get_storage_size()
+    most = MOST_INFLATION * stored if h5py.h5z.FILTER_DEFLATE in filters else min(stored, file_bytes)
+    if data.nbytes > most:
+        raise ValueError(f"/{name} declares {data.nbytes} bytes, the file holds {stored} for it")
+
+
 def encode_utf8(text: str) -> bytes:
-    """UTF-8, and what a file's name holds beyond that escaped, as JSON has it."""
+    """Encode text as UTF-8; bytes of file names that are no text are escaped as in JSON."""
     return text.encode(errors="backslashreplace")

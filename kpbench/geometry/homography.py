@@ -95,15 +95,40 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     >>> centre.tolist(), major.tolist(), minor.tolist(), angle_deg.tolist()
     ([[100.0, 50.0]], [20.0], [10.0], [0.0])
     """
-    dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        dual = np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan)
+    dual = _project_dual_conics(H_patch2image)
     x, y = dual[:, 0, 2], dual[:, 1, 2]
     xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
     middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
     major, minor = np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
     angle_deg = np.degrees(np.arctan2(2 * xy, xx - yy) / 2) % 180.0
     return dual[:, :2, 2], major, minor, angle_deg
+
+
+def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
+    """Return the boxes around the ellipses of :func:`project_discs`.
+
+    Parameters
+    ----------
+    H_patch2image : ndarray of shape (N, 3, 3)
+        Homographies from the unit disc to px.
+
+    Returns
+    -------
+    centre : ndarray of shape (N, 2)
+        Centres of the ellipses, px.
+    half_size : ndarray of shape (N, 2)
+        Half widths and half heights of the boxes, px.
+    """
+    dual = _project_dual_conics(H_patch2image)
+    centre = dual[:, :2, 2]
+    return centre, np.sqrt(centre**2 - dual[:, (0, 1), (0, 1)])
+
+
+def _project_dual_conics(H_patch2image: Float) -> Float:
+    """Return the dual conic of the unit circle under many homographies, scaled to 1 in the last entry."""
+    dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan))
 
 
 def project_disc(H_patch2image: Float) -> Ellipse:

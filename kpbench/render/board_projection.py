@@ -17,7 +17,7 @@ from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import BoardLike
 from kpbench.types import Float
 
-MARGIN = 0.01
+FREE_MARGIN = 0.01
 """Width of the border of the image that stays free of the board, in image widths."""
 LONGEST_PIECE_PX = 8.0
 """Longest straight piece of a projected outline where the lens bends lines, px."""
@@ -134,7 +134,7 @@ def pose_board(
     # rotation_xyz turns +y (down) away from the camera for a positive x, and +x towards it for a positive y
     R = rotation_xyz(0, -yaw_deg, 0) @ rotation_xyz(-pitch_deg, 0, 0) @ rotation_xyz(0, 0, roll_deg)
     size = np.array([camera.width_px, camera.height_px])
-    margin_px = MARGIN * camera.width_px
+    margin_px = FREE_MARGIN * camera.width_px
     for fraction in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
         ray = np.append(fraction * np.asarray(shift) * size / camera.focal_px, 1.0)
         pose = Pose(R, _find_depth(camera, board, R, ray, area_percent / 100 * size.prod()) * ray)

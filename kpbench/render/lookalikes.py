@@ -16,7 +16,7 @@ from kpbench.types import Float, UInt8
 
 
 @dataclass(frozen=True)
-class Shape:
+class Lookalike:
     """Place, size and inks of one look-alike.
 
     Attributes
@@ -24,11 +24,11 @@ class Shape:
     x, y : float
         Centre, px.
     radius : float
-        Semi-axis along the shape's own x axis, px.
+        Semi-axis along the look-alike's own x axis, px.
     ratio : float
-        Semi-axis along the shape's own y axis, as a fraction of ``radius``.
+        Semi-axis along the look-alike's own y axis, as a fraction of ``radius``.
     angle_deg : float
-        Angle from the image's x axis to the shape's x axis, towards +y.
+        Angle from the image's x axis to the look-alike's x axis, towards +y.
     ink, second_ink : float
         Grey levels; one is dark, the other is light.
     """
@@ -79,12 +79,12 @@ def draw_lookalikes(
         x, y = rng.uniform(0, 1, 2) * (width, height)
         radius = float(np.exp(rng.uniform(*np.log(radius_px))))
         ratio, angle_deg = float(rng.uniform(0.4, 1)), float(rng.uniform(0, 360))
-        shape = Shape(float(x), float(y), radius, ratio, angle_deg, ink, second_ink)
-        kind = int(rng.integers(len(SHAPE_DRAWERS) + 1))
-        if kind < len(SHAPE_DRAWERS):
-            SHAPE_DRAWERS[kind](image, rng, shape)
+        lookalike = Lookalike(float(x), float(y), radius, ratio, angle_deg, ink, second_ink)
+        kind = int(rng.integers(len(DRAWERS) + 1))
+        if kind < len(DRAWERS):
+            DRAWERS[kind](image, rng, lookalike)
         else:
-            _draw_half_patch(image, rng, shape, patches[int(rng.integers(len(patches)))])
+            _draw_half_patch(image, rng, lookalike, patches[int(rng.integers(len(patches)))])
 
 
 def _colour(image: UInt8, level: float) -> tuple[float, ...]:
@@ -97,73 +97,75 @@ def _to_sixteenths(points: Float) -> np.ndarray[tuple[int, ...], np.dtype[np.int
     return np.rint(points * 16).astype(np.int32)
 
 
-def _fill_ellipse(image: UInt8, shape: Shape, scale: float, level: float, end_deg: float = 360) -> None:
-    """Fill the ellipse of a shape, scaled about its centre; with ``end_deg`` 180 only one half."""
-    centre = (round(shape.x * 16), round(shape.y * 16))
-    axes = (round(shape.radius * scale * 16), round(shape.radius * shape.ratio * scale * 16))
-    cv2.ellipse(image, centre, axes, shape.angle_deg, 0, end_deg, _colour(image, level), -1, cv2.LINE_AA, 4)
+def _fill_ellipse(image: UInt8, lookalike: Lookalike, scale: float, level: float, end_deg: float = 360) -> None:
+    """Fill the ellipse of a look-alike, scaled about its centre; with ``end_deg`` 180 only one half."""
+    centre = (round(lookalike.x * 16), round(lookalike.y * 16))
+    axes = (round(lookalike.radius * scale * 16), round(lookalike.radius * lookalike.ratio * scale * 16))
+    cv2.ellipse(image, centre, axes, lookalike.angle_deg, 0, end_deg, _colour(image, level), -1, cv2.LINE_AA, 4)
 
 
-def _draw_disc(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
-    _fill_ellipse(image, shape, 1, shape.ink)
+def _draw_disc(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
+    _fill_ellipse(image, lookalike, 1, lookalike.ink)
 
 
-def _draw_rings(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_rings(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     for n, scale in enumerate(np.linspace(1, 0, int(rng.integers(2, 5)), endpoint=False)):
-        _fill_ellipse(image, shape, float(scale), (shape.ink, shape.second_ink)[n % 2])
+        _fill_ellipse(image, lookalike, float(scale), (lookalike.ink, lookalike.second_ink)[n % 2])
 
 
-def _draw_half_disc(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_half_disc(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a disc, one half dark and one half light."""
-    _fill_ellipse(image, shape, 1, shape.second_ink)
-    _fill_ellipse(image, shape, 1, shape.ink, 180)
+    _fill_ellipse(image, lookalike, 1, lookalike.second_ink)
+    _fill_ellipse(image, lookalike, 1, lookalike.ink, 180)
 
 
-def _draw_polygon(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_polygon(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a triangle or a quadrangle."""
     angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 5))))
-    corners = np.column_stack([shape.x + shape.radius * np.cos(angles), shape.y + shape.radius * np.sin(angles)])
-    cv2.fillPoly(image, [_to_sixteenths(corners)], _colour(image, shape.ink), cv2.LINE_AA, 4)
+    corners = np.column_stack(
+        [lookalike.x + lookalike.radius * np.cos(angles), lookalike.y + lookalike.radius * np.sin(angles)]
+    )
+    cv2.fillPoly(image, [_to_sixteenths(corners)], _colour(image, lookalike.ink), cv2.LINE_AA, 4)
 
 
-def _draw_text(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_text(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     text = "".join(chr(c) for c in rng.integers(48, 91, int(rng.integers(1, 5))))
-    place = (round(shape.x - shape.radius), round(shape.y + shape.radius / 2))
+    place = (round(lookalike.x - lookalike.radius), round(lookalike.y + lookalike.radius / 2))
     font, thickness = int(rng.integers(8)), int(rng.integers(1, 4))
-    cv2.putText(image, text, place, font, shape.radius / 20, _colour(image, shape.ink), thickness, cv2.LINE_AA)
+    cv2.putText(image, text, place, font, lookalike.radius / 20, _colour(image, lookalike.ink), thickness, cv2.LINE_AA)
 
 
-def _draw_bar(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_bar(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a bar or a line, six radii long."""
-    angle = np.radians(shape.angle_deg)
-    half = 3 * shape.radius * np.array([np.cos(angle), np.sin(angle)])
-    start, end = ((round(shape.x + sign * half[0]), round(shape.y + sign * half[1])) for sign in (-1, 1))
-    cv2.line(image, start, end, _colour(image, shape.ink), int(rng.integers(1, 8)), cv2.LINE_AA)
+    angle = np.radians(lookalike.angle_deg)
+    half = 3 * lookalike.radius * np.array([np.cos(angle), np.sin(angle)])
+    start, end = ((round(lookalike.x + sign * half[0]), round(lookalike.y + sign * half[1])) for sign in (-1, 1))
+    cv2.line(image, start, end, _colour(image, lookalike.ink), int(rng.integers(1, 8)), cv2.LINE_AA)
 
 
-def _draw_chequers(image: UInt8, rng: np.random.Generator, shape: Shape) -> None:
+def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a chequer board: each corner looks like the patch ``checker``, but has neighbours."""
     rows, columns = (int(v) for v in rng.integers(3, 8, 2))
-    side = min(shape.radius, 18.0)
-    A = _rotation(shape.angle_deg) @ np.diag([side, side * max(shape.ratio, 0.5)])
+    side = min(lookalike.radius, 18.0)
+    A = _rotation(lookalike.angle_deg) @ np.diag([side, side * max(lookalike.ratio, 0.5)])
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - (columns / 2, rows / 2)
     for i in range(rows):
         for j in range(columns):
-            square = _to_sixteenths((corners + np.array([j, i])) @ A.T + (shape.x, shape.y))
-            level = (shape.ink, shape.second_ink)[(i + j) % 2]
+            square = _to_sixteenths((corners + np.array([j, i])) @ A.T + (lookalike.x, lookalike.y))
+            level = (lookalike.ink, lookalike.second_ink)[(i + j) % 2]
             cv2.fillConvexPoly(image, square, _colour(image, level), cv2.LINE_8, 4)
 
 
-def _draw_half_patch(image: UInt8, rng: np.random.Generator, shape: Shape, patch: Patch) -> None:
+def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalike, patch: Patch) -> None:
     """Draw one side of a patch, cut off beside its centre, so that the keypoint itself is missing."""
     black, disc = unit_polygons(patch, 2.0**-8)
     cut = float(rng.uniform(0.15, 0.4))  # distance from the centre to the cut, in radii
     spin = _rotation(float(rng.uniform(0, 360)))
-    A = _rotation(shape.angle_deg) @ np.diag([1, shape.ratio]) * shape.radius
-    light, dark = max(shape.ink, shape.second_ink), min(shape.ink, shape.second_ink)
+    A = _rotation(lookalike.angle_deg) @ np.diag([1, lookalike.ratio]) * lookalike.radius
+    light, dark = max(lookalike.ink, lookalike.second_ink), min(lookalike.ink, lookalike.second_ink)
     for polygons, level in ((disc, light), (black, dark)):
         # vertices beyond the cut move onto the cut, where the part that they enclose has no area
-        kept = [np.maximum(polygon @ spin.T, (cut, -np.inf)) @ A.T + (shape.x, shape.y) for polygon in polygons]
+        kept = [np.maximum(polygon @ spin.T, (cut, -np.inf)) @ A.T + (lookalike.x, lookalike.y) for polygon in polygons]
         cv2.fillPoly(image, [_to_sixteenths(points) for points in kept], _colour(image, level), cv2.LINE_8, 4)
 
 
@@ -173,7 +175,7 @@ def _rotation(angle_deg: float) -> Float:
     return np.array([[c, -s], [s, c]])
 
 
-SHAPE_DRAWERS: tuple[Callable[[UInt8, np.random.Generator, Shape], None], ...] = (
+DRAWERS: tuple[Callable[[UInt8, np.random.Generator, Lookalike], None], ...] = (
     _draw_disc,
     _draw_rings,
     _draw_half_disc,

@@ -1,13 +1,13 @@
 import numpy as np
 
-from kpbench.dataset.card import facts, histograms, write_card
+from kpbench.dataset.card import dataset_facts, dataset_histograms, write_card
 from kpbench.dataset.generation import generate
 from kpbench.render.placement import Limits
 from kpbench.synth.synthetic import SynthConfig
 
 
 def test_every_keypoint_is_in_every_histogram(dataset):
-    made = {histogram.title: histogram for histogram in histograms(dataset)}
+    made = {histogram.title: histogram for histogram in dataset_histograms(dataset)}
     assert made.pop("keypoints an image").counts.sum() == len(dataset)
     assert len(made) == 6
     for histogram in made.values():
@@ -18,7 +18,7 @@ def test_every_keypoint_is_in_every_histogram(dataset):
 def test_the_card_lies_beside_the_manifest_and_tells_the_facts(dataset):
     card = (dataset.path / "README.md").read_text()
     assert card.startswith("---\npretty_name: ")
-    assert all(f"| {key} | {value} |" in card for key, value in facts(dataset).items())
+    assert all(f"| {key} | {value} |" in card for key, value in dataset_facts(dataset).items())
     assert "| 3 (mushroom) |" in card
     assert (dataset.path / "preview.png").read_bytes().startswith(b"\x89PNG")
 

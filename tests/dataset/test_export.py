@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench.dataset import export as interchange
+from kpbench.dataset import export
 from kpbench.dataset.export import export_dataset
 from kpbench.errors import DataError
 
@@ -81,11 +81,11 @@ def test_an_export_never_mixes_with_what_is_there(dataset, tmp_path):
 def test_names_of_designs_stay_text_in_yaml(dataset, tmp_path, monkeypatch):
     yaml = pytest.importorskip("yaml")
     called = {0: "no", 1: "a: b", 2: "wheel", 3: "1"}
-    monkeypatch.setattr(interchange, "names", lambda dataset: called)
+    monkeypatch.setattr(export, "patch_names", lambda dataset: called)
     export_dataset(dataset, "yolo", tmp_path / "yolo")
     assert yaml.safe_load((tmp_path / "yolo" / "data.yaml").read_text())["names"] == called
 
 
 def test_a_contrast_that_nobody_could_measure_is_null_in_json():
-    assert interchange._numbers(np.array([1.5, np.nan])) == [1.5, None]
-    assert interchange._numbers(np.array([3])) == [3]
+    assert export._to_json_numbers(np.array([1.5, np.nan])) == [1.5, None]
+    assert export._to_json_numbers(np.array([3])) == [3]

@@ -214,7 +214,7 @@ def test_a_missing_folder_says_how_to_make_one(tmp_path):
 
 
 def test_many_shards_need_few_open_files(tmp_path, monkeypatch):
-    monkeypatch.setattr(folder, "MOST_OPEN", 2)
+    monkeypatch.setattr(folder, "MOST_OPEN_SHARDS", 2)
     data = open_dataset(write_dataset(tmp_path / "set", counts=(2, 2, 2, 2, 2)))
     assert data.truth.image_id.tolist() == list(range(10))
     expected = [sample for first in range(0, 10, 2) for sample in samples(2, first)]

@@ -22,7 +22,6 @@ from kpbench.render.scene import rasterise_patches
 from kpbench.synth.finish import unoccluded_fraction
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.synth.user_pipeline import load_augmentation
-from kpbench.workers import dask_executor
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +57,7 @@ def test_neither_workers_nor_an_interruption_change_a_byte(photos, tmp_path):
     with pytest.raises(Stop):
         generate(config(photos), tmp_path / "three", workers=1, progress=interrupt)
     assert [p.name for p in (tmp_path / "three").iterdir()] == ["shard-00000.h5"]
-    with pytest.raises(DataError, match="holds an unfinished dataset; add --resume"):
+    with pytest.raises(DataError, match="holds an unfinished dataset; add `resume=True`"):
         generate(config(photos), tmp_path / "three", workers=1)
     run = generate(config(photos), tmp_path / "three", workers=1, resume=True)
     assert run.kept == 4
@@ -142,9 +141,9 @@ def test_radii_are_kept_and_small_ones_asked_for(photos):
 
 def test_broken_backgrounds_are_counted_in_the_manifest(photos, tmp_path):
     run = generate(config(photos, n=20), tmp_path / "set", workers=1)
-    assert run.broken == ("broken.jpg",)
+    assert run.broken_files == ("broken.jpg",)
     assert run.dataset.provenance["broken_backgrounds"] == ["broken.jpg"]
-    assert "broken.jpg" not in {run.dataset._shard(0)["background"].asstr()[0]}
+    assert "broken.jpg" not in {run.dataset._open(0)["background"].asstr()[0]}
 
 
 def test_another_dataset_in_the_folder_is_kept(photos, tmp_path):
@@ -153,7 +152,7 @@ def test_another_dataset_in_the_folder_is_kept(photos, tmp_path):
     for changed in (config(photos, seed=9), config(photos, n=6), config(None)):
         with pytest.raises(DataError, match="already holds a dataset"):
             generate(changed, tmp_path, workers=1)
-        with pytest.raises(DataError, match="of another dataset than this command makes"):
+        with pytest.raises(DataError, match=r"of another dataset.*; pass `overwrite=True`"):
             generate(changed, tmp_path, workers=1, resume=True)
     assert digests(tmp_path) == before
     generate(config(photos, n=3), tmp_path, workers=1, overwrite=True)
@@ -241,7 +240,7 @@ def test_parts_of_different_sets_are_not_put_together(photos, tmp_path):
     generate_part(config(photos, seed=1), tmp_path, range(2, 3), workers=1)
     with pytest.raises(DataError, match=r"shard-00002\.h5: of another dataset"):
         merge(tmp_path)
-    with pytest.raises(DataError, match="--shard-range is 2:4, expected A:B with 0 <= A < B <= 3"):
+    with pytest.raises(DataError, match="`shards` is 2:4, expected A:B with 0 <= A < B <= 3"):
         generate_part(config(photos), tmp_path, range(2, 4), workers=1)
     with pytest.raises(DataError, match="holds an unfinished dataset"):
         generate_part(config(photos), tmp_path, range(2), workers=1)
@@ -262,8 +261,8 @@ def test_dask_gives_the_same_bytes(photos, tmp_path):
     distributed = pytest.importorskip("distributed")
     generate(config(photos), tmp_path / "one", workers=1)
     local = {"n_workers": 1, "threads_per_worker": 2, "processes": False, "dashboard_address": None}
-    with distributed.LocalCluster(**local) as cluster, dask_executor(cluster.scheduler_address) as executor:
-        generate(config(photos), tmp_path / "two", executor=executor)
+    with distributed.LocalCluster(**local) as cluster:
+        generate(config(photos), tmp_path / "two", scheduler=cluster.scheduler_address)
     assert digests(tmp_path / "one") == digests(tmp_path / "two")
 
 
@@ -335,7 +334,7 @@ def test_a_damaged_shard_is_not_taken_for_a_whole_one(tmp_path):
     data = bytearray(path.read_bytes())
     data[inside] ^= 1
     path.write_bytes(data)
-    with pytest.raises(DataError, match=r"shard-00001\.h5: damaged since it was written; delete it, and --resume"):
+    with pytest.raises(DataError, match=r"shard-00001\.h5: damaged since it was written; delete it, and resume"):
         generate(SynthConfig(4, size_px=(64, 64), shard_size=2), tmp_path / "set", workers=1, resume=True)
     with pytest.raises(DataError, match="damaged"):
         merge(tmp_path / "set")

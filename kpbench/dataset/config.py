@@ -1,0 +1,52 @@
+"""The protocol of a configuration from which a dataset is made."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from kpbench.dataset.shard import Sample
+
+
+class DatasetConfig(Protocol):
+    """The configuration of a dataset; with the background files, it determines every image.
+
+    A configuration is picklable and hashable. kpbench has two: :class:`kpbench.SynthConfig` and
+    :class:`kpbench.SuiteConfig`.
+
+    Examples
+    --------
+    >>> from kpbench import SynthConfig
+    >>> from kpbench.dataset import DatasetConfig
+    >>> config: DatasetConfig = SynthConfig(n=20_000)
+    >>> config.n, config.shard_size
+    (20000, 500)
+    """
+
+    @property
+    def n(self) -> int:
+        """Number of images."""
+        ...
+
+    @property
+    def shard_size(self) -> int:
+        """Images per shard."""
+        ...
+
+    @property
+    def image_bytes(self) -> int:
+        """Expected size of one image on disk."""
+        ...
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the config that is written into the dataset; it holds no path."""
+        ...
+
+    def scene_id(self, index: int) -> int:
+        """Return the base scene of an image. Shards are made scene by scene, so that a scene's background is reused."""
+        ...
+
+    def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
+        """Make one image; return it with the background files that could not be decoded."""
+        ...
+
+    def __hash__(self) -> int: ...
