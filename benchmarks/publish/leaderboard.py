@@ -1,10 +1,10 @@
-"""The leaderboard, its figure and the README's table from the scores in benchmarks/results.
+"""The leaderboard, its figure and the table of the findings from the scores in benchmarks/results.
 
-    python benchmarks/publish/leaderboard.py                        # writes README.md, and in docs/results: two files
+    python benchmarks/publish/leaderboard.py                        # writes three files of docs/results
     python benchmarks/publish/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
 
-The README's table and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another size or
-over photographs are kept apart.
+The table of the findings and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another
+size or over photographs are kept apart.
 Of a scores file only what the tables need is kept: all images, and every condition and rung.
 """
 
@@ -31,8 +31,8 @@ from kpbench.report import (
 from kpbench.scoring import LABELS
 
 ROOT = Path(__file__).parents[2]
-RESULTS, README = ROOT / "benchmarks" / "results", ROOT / "README.md"
-PAGE, FIGURE = ROOT / "docs" / "results" / "leaderboard.md", ROOT / "docs" / "results" / "severity.svg"
+RESULTS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs" / "results"
+PAGE, FINDINGS, FIGURE = DOCS / "leaderboard.md", DOCS / "findings.md", DOCS / "severity.svg"
 ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
 SHOWN_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
@@ -46,7 +46,7 @@ HEAD = """\
 Made by `python benchmarks/publish/leaderboard.py` from the scores in `benchmarks/results`, which `kpbench bench` wrote.
 All images are **simulated**. Brackets hold 95 % intervals from resampled scenes; how few scenes there are stands over
 each table. What boards of tags are, and how far they compare with patches:
-[fairness to tags](../explanation/fairness-to-tags.md#patches-against-tags).
+[patches against tags](../explanation/fairness-to-tags.md).
 
 To enter a detector: run the command below a heading with `--detector` yours, then
 `python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
@@ -118,7 +118,7 @@ def by_rung(runs: list[dict[str, Any]], condition: dict[str, Any]) -> Table:
 
 
 def summary(runs: list[dict[str, Any]]) -> Table:
-    """The README's table: the mean over the rungs of each of the paper's conditions."""
+    """The table of the findings: the mean over the rungs of each of the paper's conditions."""
 
     def mean(values: Sequence[float]) -> float:
         return sum(values) / len(values)
@@ -138,8 +138,8 @@ def summary(runs: list[dict[str, Any]]) -> Table:
     return Table("", ("detection score, mean of the rungs", "images", *PAPER, "false alarms per image"), tuple(rows))
 
 
-def readme(text: str, runs: list[dict[str, Any]]) -> str:
-    """The README with its table made anew."""
+def findings(text: str, runs: list[dict[str, Any]]) -> str:
+    """The page of the findings with its table made anew."""
     table = to_markdown(summary(runs)).partition("\n\n")[2]
     return re.sub(r"(?s)(<!-- benchmarks/publish/leaderboard.py -->\n).*?(?=<!-- end -->)", rf"\g<1>{table}", text)
 
@@ -214,7 +214,7 @@ def main() -> None:
     if folder:
         take(folder)
     text, picture = page(RESULTS)
-    README.write_text(readme(README.read_text(), load(RESULTS / "paper-v1")))
+    FINDINGS.write_text(findings(FINDINGS.read_text(), load(RESULTS / "paper-v1")))
     PAGE.write_text(text)
     FIGURE.write_text(picture)
 

@@ -42,9 +42,10 @@ def test_a_result_follows_from_its_counts_and_names_a_frozen_suite(path):
     assert rungs == {(c["name"], rung) for c in config["conditions"] for rung in c["rungs"]}
 
 
-def test_the_leaderboard_and_the_readme_are_made_of_the_results():
-    readme = (ROOT / "README.md").read_text()
-    assert leaderboard.readme(readme, leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")) == readme
+def test_the_leaderboard_and_the_findings_are_made_of_the_results():
+    findings = (ROOT / "docs" / "results" / "findings.md").read_text()
+    runs = leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")
+    assert leaderboard.findings(findings, runs) == findings
     text, picture = leaderboard.page(ROOT / "benchmarks" / "results")
     assert (ROOT / "docs" / "results" / "leaderboard.md").read_text() == text
     assert (ROOT / "docs" / "results" / "severity.svg").read_text() == picture

@@ -1,0 +1,91 @@
+"""Make the pictures of README.md and docs/tutorial.md: docs/images/*.png, of designs and simulated images alone.
+
+    python docs/make_images.py
+
+The commands are those that the pages show.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+import kpbench
+from kpbench.cli import main as command_line
+
+IMAGES = Path(__file__).parent / "images"
+PATCH_PX, MARGIN_PX, LABEL_PX = 160, 24, 36
+SAMPLES = 8
+"""Samples per pixel and axis of the drawn patches."""
+LEVEL_STEP = 8
+"""Grey levels between the levels of a saved picture: a third of the size, and hardly to be seen."""
+README_SCENE = 19
+"""The first scene of seed 0 that holds all four designs."""
+BOARD_IMAGE = 13
+"""Of the tutorial's photographs: trefoil at a pitch of 30 degrees."""
+
+
+def kpbench_command(line: str) -> None:
+    """Run a command line in this process, without its output."""
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        command_line.main(line.split()[1:], standalone_mode=False)
+
+
+def draw_patches() -> Image.Image:
+    """Return the shipped designs side by side, each with its name and ID below."""
+    side = PATCH_PX + 2 * MARGIN_PX
+    step = 2 / (PATCH_PX * SAMPLES)
+    axis = np.arange(-side * SAMPLES / 2, side * SAMPLES / 2) * step + step / 2
+    points = np.stack(np.meshgrid(axis, axis), axis=-1)
+    tiles = []
+    for patch in kpbench.shipped_patches():
+        black = patch.is_black(points) | (np.abs(np.hypot(points[..., 0], points[..., 1]) - 1) < 1.5 / PATCH_PX)
+        grey = 255 * (1 - black.reshape(side, SAMPLES, side, SAMPLES).mean(axis=(1, 3)))
+        tile = np.full((side + LABEL_PX, side), 255, np.uint8)
+        tile[:side] = grey.round()
+        label = f"{patch.name} ({patch.patch_id})"
+        (width, _), _ = cv2.getTextSize(label, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 1)
+        place = ((side - width) // 2, side + 12)
+        cv2.putText(tile, label, place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, 60, 1, cv2.LINE_AA)
+        tiles.append(tile)
+    return Image.fromarray(np.hstack(tiles))
+
+
+def save(name: str, source: Image.Image | str) -> None:
+    """Write a picture, or a picture file again, with few levels."""
+    image = np.asarray((source if isinstance(source, Image.Image) else Image.open(source)).convert("RGB"))
+    few = np.minimum((image.astype(int) + LEVEL_STEP // 2) // LEVEL_STEP * LEVEL_STEP, 255).astype(np.uint8)
+    Image.fromarray(few).quantize(256, dither=Image.Dither.NONE).save(IMAGES / f"{name}.png", optimize=True)
+
+
+def main() -> None:
+    """Write every picture."""
+    IMAGES.mkdir(exist_ok=True)
+    save("patches", draw_patches())
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        kpbench_command("kpbench render-patches --board hexagon --patch trefoil --png --dpi 60")
+        save("page", "patches-print/hexagon-trefoil.png")
+
+        kpbench_command("kpbench synth --n 20 --deteriorate none")
+        kpbench_command("kpbench detect kpbench-data --detector superpoint-small --overlay found")
+        save("found", f"found/{README_SCENE:08d}.png")
+
+        kpbench_command("kpbench suite paper-v1 --images 1 --size 640x480 --only pitch,noise --out photographs")
+        kpbench_command("kpbench export photographs --format coco")
+        photo = f"photographs-coco/images/{BOARD_IMAGE:08d}.png"
+        kpbench_command(f"kpbench detect {photo} --detector superpoint-small --overlay found.png")
+        save("photo", photo)
+        save("found-board", "found.png")
+    for path in sorted(IMAGES.glob("*.png")):
+        print(f"{os.path.relpath(path)}: {path.stat().st_size / 1000:.0f} kB")
+
+
+if __name__ == "__main__":
+    main()
