@@ -1,15 +1,34 @@
-"""Random numbers: every stage of every image has a stream of its own."""
+"""Seeds: every stage of every image has random numbers of its own."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Stages of an image of a synthetic set; a number once given is never given again, as pixels depend on it
+# The pixels of every dataset depend on these numbers: a new stage gets a new number, and no number changes its meaning
 SYNTH_BACKGROUND, SYNTH_SCENE, SYNTH_DETERIORATION, SYNTH_LOOKALIKES, SYNTH_AUGMENTATION = range(5)
-# Stages of a scene of a suite
+"""Stages of an image of a synthetic set."""
 SUITE_BACKGROUND, SUITE_SCENE, SUITE_EFFECT, SUITE_FIELD = range(16, 20)
+"""Stages of a base scene of a suite: pose and light are one stage, the fields of noise and low light another."""
 
 
 def stream(seed: int, index: int, stage: int) -> np.random.Generator:
-    """Random numbers of one stage of one image, independent of every other stage and image."""
+    """Return the random numbers of one stage of one image.
+
+    They are independent of the random numbers of every other stage, image and seed.
+
+    Parameters
+    ----------
+    seed : int
+        Seed of the dataset, 0 or more.
+    index : int
+        Number of the image, or of the base scene in a suite.
+    stage : int
+        One of the constants of this module.
+
+    Examples
+    --------
+    >>> from kpbench.seeds import SYNTH_SCENE, stream
+    >>> stream(0, 7, SYNTH_SCENE).random() == stream(0, 7, SYNTH_SCENE).random()
+    True
+    """
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(index, stage))))

@@ -31,11 +31,11 @@ JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
 Progress = Callable[[int], None]
 """A function that is called with the number of images finished since its last call."""
+
 PROGRESS_INTERVAL_S = 0.2
 """Longest time between two reports of progress, s: a progress bar moves smoothly."""
 JOBS_AHEAD = 4
 """Jobs per worker process that :func:`run_in_order` submits before their results are asked for."""
-
 WORKER_DIED = "a worker process died (out of memory?)"
 
 
@@ -72,38 +72,50 @@ def run_jobs(
     """
     workers = min(workers or count_cores(), len(jobs))
     if executor is not None:
-        futures = [executor.submit(_run_remote, work, job) for job in jobs]
-        try:
-            for result, images in _in_order_of_completion(futures, lambda: None):
-                progress(images)
-                yield result
-        except BrokenExecutor:
-            raise DataError(WORKER_DIED) from None
-        finally:
-            for future in futures:
-                future.cancel()
-    elif workers <= 1:
+        yield from _run_on_executor(work, jobs, executor, progress)
+    elif workers > 1:
+        yield from _run_in_processes(work, jobs, workers, progress)
+    else:
         with _one_thread():
             for job in jobs:
                 yield work(job, progress)
-    else:
-        with _process_pool(workers) as (pool, counter):
-            reported = 0
 
-            def report_progress() -> None:
-                nonlocal reported
-                finished = counter.value
-                progress(finished - reported)
-                reported = finished
 
-            futures_here = [pool.submit(_run_counted, work, job) for job in jobs]
-            yield from _in_order_of_completion(futures_here, report_progress)
+def _run_on_executor(
+    work: Callable[[JobT, Progress], ResultT], jobs: Sequence[JobT], executor: Executor, progress: Progress
+) -> Iterator[ResultT]:
+    futures = [executor.submit(_run_remote, work, job) for job in jobs]
+    try:
+        for result, images in _in_order_of_completion(futures, lambda: None):
+            progress(images)
+            yield result
+    except BrokenExecutor:
+        raise DataError(WORKER_DIED) from None
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _run_in_processes(
+    work: Callable[[JobT, Progress], ResultT], jobs: Sequence[JobT], workers: int, progress: Progress
+) -> Iterator[ResultT]:
+    with _process_pool(workers) as (pool, counter):
+        reported = 0
+
+        def report_progress() -> None:
+            nonlocal reported
+            finished = counter.value
+            progress(finished - reported)
+            reported = finished
+
+        futures = [pool.submit(_run_counted, work, job) for job in jobs]
+        yield from _in_order_of_completion(futures, report_progress)
 
 
 def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers: int) -> Iterator[ResultT]:
-    """Yield the result of every job in the order of the jobs; worker processes run a few jobs ahead.
+    """Yield the result of every job in the order of the jobs; worker processes work a few jobs ahead.
 
-    The jobs may be endless: they are taken one by one as results are asked for.
+    Jobs are taken one by one as results are asked for, so that their number may be infinite.
 
     Parameters
     ----------
@@ -135,12 +147,12 @@ def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers:
 def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     """Start worker processes; yield their pool and a counter of finished images that they share.
 
-    When the block ends early, by an error or because nobody asks for more results, the processes are killed.
+    The processes are killed if the block ends early: by an error, or because no more results are asked for.
     """
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV, HDF5 or torch may hang
     counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    pool.submit(int)  # the first job starts all processes, so the next line can tell them from the caller's own
+    pool.submit(int)  # this first job starts all processes, so that the next line finds them
     processes = set(multiprocessing.active_children()) - others
     try:
         yield pool, counter
@@ -151,12 +163,12 @@ def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
             raise DataError(WORKER_DIED) from None
         raise
     finally:
-        # the pool has a thread of its own; after a worker's death Python must not exit while that thread cleans up
+        # the pool has its own thread, which must end before Python exits, also after the death of a worker
         pool.shutdown(wait=True, cancel_futures=True)
 
 
 def _in_order_of_completion(futures: Sequence[Future[ResultT]], tick: Callable[[], None]) -> Iterator[ResultT]:
-    """Yield results as they come; call ``tick`` at least every ``PROGRESS_INTERVAL_S``."""
+    """Yield results as jobs finish; call ``tick`` at least every ``PROGRESS_INTERVAL_S``."""
     waiting = set(futures)
     while waiting:
         done, waiting = wait(waiting, timeout=PROGRESS_INTERVAL_S, return_when=FIRST_COMPLETED)
@@ -198,13 +210,13 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
 
 def use_one_thread() -> None:
-    """Make OpenCV and BLAS use one thread in this process; on small matrices their threads cost more than they save."""
+    """Make OpenCV and BLAS use one thread in this process; on small matrices, more threads cost more than they save."""
     cv2.setNumThreads(1)
     threadpool_limits(1)
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Make BLAS use one thread within a ``with`` block; its idle threads would keep cores busy that others need."""
+    """Make BLAS use one thread within a ``with`` block; further threads would wait busily and slow other work down."""
     limit: AbstractContextManager[Any] = _threadpool_controller().limit(limits=1, user_api="blas")
     return limit
 
@@ -231,9 +243,9 @@ _counter: Any = None
 
 
 def _start_worker(counter: Any) -> None:
-    """Prepare a new worker process: one thread, deaf to signals, and ended with its parent.
+    """Prepare a new worker process: use one thread, ignore signals, and end with the parent process.
 
-    The parent alone decides when to stop: Ctrl-C and batch systems send their signal to every process of a run.
+    Ctrl-C and batch systems send their signal to every process of a run. The parent alone decides what to do.
     """
     global _counter
     _counter = counter

@@ -45,7 +45,7 @@ def blur(image: UInt8, kernel_px: float) -> UInt8:
 
 
 def box_taps(kernel_px: float) -> Float:
-    """Weights of a box mean of any width, even or fractional, centred on the middle tap."""
+    """Return the weights of a box mean of any width, even or fractional, centred on the middle tap."""
     reach = int(np.ceil((kernel_px - 1) / 2))
     taps = np.ones(2 * reach + 1)
     taps[[0, -1]] -= (2 * reach + 1 - kernel_px) / 2 if reach else 0.0
@@ -77,7 +77,7 @@ def gaussian_blur(image: UInt8, sigma_px: float) -> UInt8:
 
 
 def gaussian_taps(sigma_px: float) -> Float:
-    """Weights of a Gaussian, out to four standard deviations, centred on the middle tap."""
+    """Return the weights of a Gaussian, out to four standard deviations, centred on the middle tap."""
     reach = int(np.ceil(4 * sigma_px))
     taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
     return np.asarray(taps / taps.sum())
@@ -113,7 +113,7 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
 
 @lru_cache(maxsize=2048)  # holds all kernels that the paper's mix can draw; those of the ladder never repeat
 def line_kernel(length_px: float, angle_deg: float) -> Float:
-    """Exact area coverage of a line, one pixel wide, through the kernel's centre; the sum is 1."""
+    """Rasterise a line, one pixel wide, through the kernel's centre, by exact area coverage; the sum is 1."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     half_length, half_width = length_px / 2, 0.5
     corners = np.array([
@@ -155,7 +155,7 @@ def defocus(image: UInt8, radius_px: float) -> UInt8:
 
 @lru_cache(maxsize=64)
 def disc_kernel(radius_px: float) -> Float:
-    """Exact area coverage of a disc about the kernel's centre, an ideal lens out of focus; the sum is 1."""
+    """Rasterise a disc about the kernel's centre by exact area coverage; the sum is 1."""
     step = 2 * np.pi / 256
     rim = arc_vertices(radius_px, np.arange(256) * step, step)
     reach = int(np.ceil(radius_px)) + 1

@@ -33,12 +33,13 @@ intensity as a fraction of the glow's strength.
 
 
 def _to_uint8(image: Any) -> UInt8:
+    """Round grey levels and clip them to 0 and 255."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
 @lru_cache(maxsize=1)
 def _normal_quantiles() -> Float:
-    """2¹⁶ equally likely values of the standard normal distribution, sorted, up to 4.3 standard deviations."""
+    """Return 2¹⁶ equally likely values of the standard normal distribution, in ascending order, up to 4.3."""
     from scipy.special import ndtri
 
     values = ndtri((np.arange(2**16) + 0.5) / 2**16)
@@ -128,7 +129,7 @@ def brightness(image: UInt8, factor: float) -> UInt8:
 
 
 def _offsets_from(image: UInt8, x: float, y: float) -> tuple[Any, Any]:
-    """Offsets of all pixels from a point: a row of shape (1, W) and a column of shape (H, 1), float32."""
+    """Return the offsets of all pixels from a point: a row of shape (1, W) and a column of shape (H, 1), float32."""
     rows, columns = image.shape[:2]
     dx = np.arange(columns, dtype=np.float32) - np.float32(x)
     dy = np.arange(rows, dtype=np.float32) - np.float32(y)
@@ -294,7 +295,7 @@ def low_light(
 
 
 def _strip_corners(strips: list[list[float]]) -> list[Float]:
-    """Corners of each strip of an occlusion, ndarray of shape (4, 2), px."""
+    """Return the corners of each strip of an occlusion, ndarray of shape (4, 2), px."""
     unit_square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     corners = []
     for x, y, length, width, angle_deg, _ in strips:
@@ -335,7 +336,7 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
 
 
 def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
-    """Fraction of each pixel of a box that :func:`occlusion` hides, ndarray of shape (height, width)."""
+    """Compute the fraction of each pixel of a box that strips hide, ndarray of shape (height, width)."""
     x, y, w, h = box
     uncovered = np.ones((h, w))
     for polygon in _strip_corners(strips):

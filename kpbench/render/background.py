@@ -247,7 +247,7 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
 
 
 def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
-    """Sum of smooth noise at all resolutions, ndarray of shape (height_px, width_px), float32, grey levels."""
+    """Draw smooth noise and sum it over all octaves, ndarray of shape (height_px, width_px), float32, grey levels."""
     strength = rng.uniform(2, 14)
     sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
     octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
@@ -259,7 +259,7 @@ def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> An
 
 
 def _circle_corners(count: int, start_deg: float = 0.0) -> Float:
-    """Corners of a regular polygon on the unit circle, ndarray of shape (count, 2)."""
+    """Return the corners of a regular polygon on the unit circle, ndarray of shape (count, 2)."""
     angles = np.radians(start_deg) + np.arange(count) * (2 * np.pi / count)
     return np.column_stack([np.cos(angles), np.sin(angles)])
 

@@ -54,7 +54,7 @@ class Pose:
 
 
 def polygon_area(points: Float) -> float:
-    """Area of a simple polygon with vertices of shape (n, 2), in either orientation."""
+    """Compute the area of a simple polygon with vertices of shape (n, 2), in either orientation."""
     x, y = (points - points[0]).T
     return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
 

@@ -224,13 +224,13 @@ def _cover(
 
 
 def _slices_within(outer: Box, inner: Box) -> tuple[slice, slice]:
-    """Rows and columns of a box within a larger box."""
+    """Return the rows and columns of a box within a larger box."""
     x, y = inner[0] - outer[0], inner[1] - outer[1]
     return slice(y, y + inner[3]), slice(x, x + inner[2])
 
 
 def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: float) -> Float:
-    """Brightness of every pixel of a box, ndarray of shape (height, width), 0 to 1."""
+    """Compute the brightness of every pixel of a box, ndarray of shape (height, width), 0 to 1."""
     x, y, w, h = box
     across = (np.arange(x, x + w) - centre_px[0]) * (appearance.slope[0] / side_px)
     down = (np.arange(y, y + h) - centre_px[1]) * (appearance.slope[1] / side_px)

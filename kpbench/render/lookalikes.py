@@ -170,7 +170,7 @@ def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalik
 
 
 def _rotation(angle_deg: float) -> Float:
-    """Rotation matrix from +x towards +y, ndarray of shape (2, 2)."""
+    """Return the rotation matrix from +x towards +y, ndarray of shape (2, 2)."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     return np.array([[c, -s], [s, c]])
 

@@ -216,7 +216,7 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
 
 
 def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, cx_px: float, cy_px: float) -> Float:
-    """First two columns of ``K [r1 r2 t] / depth``, ndarray of shape (n, 3, 3); the third column is not set.
+    """Compute the first two columns of ``K [r1 r2 t] / depth``, ndarray of shape (n, 3, 3); the third is not set.
 
     The depth is focal / radius, in disc radii. The rotation is that of
     :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]``
