@@ -8,7 +8,7 @@ from kpbench.cli import main
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.files import sha256_of, write_atomic
-from kpbench.types import KEYPOINT_DTYPE
+from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions
 
 
 def kpbench(*arguments, code=0):
@@ -31,6 +31,12 @@ def digests(folder):
     return {path.name: sha256_of(path) for path in sorted(folder.iterdir()) if path.is_file()}
 
 
+def rotation(deg):
+    """Matrix (2, 2) of a rotation from x towards y."""
+    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
+    return np.array([[c, -s], [s, c]])
+
+
 def write_dataset(folder, images, condition="", seed=0):
     """A dataset of tiny images; each entry is a list of (x, y, radius, id)."""
     folder.mkdir()
@@ -48,3 +54,9 @@ def write_dataset(folder, images, condition="", seed=0):
     write_atomic(path, encode_shard(samples, len(samples), config))
     write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
     return open_dataset(folder)
+
+
+def perfect_predictions(images, **about):
+    """Predictions of every keypoint of such images, with its ID and a score of 1."""
+    found = [Detections([r[:2] for r in rows], [1.0] * len(rows), [r[3] for r in rows]) for rows in images]
+    return Predictions.from_detections(found, **about)

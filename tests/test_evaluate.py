@@ -4,7 +4,7 @@ import json
 from dataclasses import replace
 
 import pytest
-from helpers import write_dataset
+from helpers import perfect_predictions, write_dataset
 
 from kpbench.errors import DataError
 from kpbench.evaluate import compare_files, score_file
@@ -15,25 +15,19 @@ from kpbench.types import Detections, Predictions
 IMAGES = [[(10, 10, 10, 0), (50, 10, 10, 1)], [(10, 10, 10, 0)], []]
 
 
-def perfect(**about):
-    found = [Detections([r[:2] for r in rows], [1.0] * len(rows), [r[3] for r in rows]) for rows in IMAGES]
-    return Predictions.from_detections(found, **about)
-
-
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(here):
     """The current folder, with a dataset and perfect predictions for it."""
-    monkeypatch.chdir(tmp_path)
-    write_dataset(tmp_path / "data", IMAGES)
-    write_predictions("p.json", perfect(dataset="data"))
-    return tmp_path
+    write_dataset(here / "data", IMAGES)
+    write_predictions("p.json", perfect_predictions(IMAGES, dataset="data"))
+    return here
 
 
 def test_a_file_scores_as_its_predictions_and_every_file_is_written(here):
     scored = score_file(
         "p.json", json_file="s.json", csv_file=here / "s.csv", report_file="r.html", eps=0.2, command=["my", "script"]
     )
-    assert scored.scores.to_dict() == score(scored.dataset, perfect(), eps=0.2).to_dict()
+    assert scored.scores.to_dict() == score(scored.dataset, perfect_predictions(IMAGES), eps=0.2).to_dict()
     content = json.loads((here / "s.json").read_text())
     assert content["provenance"] == scored.provenance
     assert content["provenance"]["command"] == "my script"

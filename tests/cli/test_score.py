@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from helpers import kpbench, write_dataset
+from helpers import kpbench, perfect_predictions, write_dataset
 
 from kpbench.dataset.export import export_dataset
 from kpbench.dataset.folder import open_dataset
@@ -18,9 +18,7 @@ IMAGES = [[(10, 10, 10, 0), (50, 10, 10, 1)], [(10, 10, 10, 0)], [], [(30, 30, 2
 
 
 def perfect(images=IMAGES, **about):
-    return Predictions.from_detections(
-        [Detections([r[:2] for r in rows], [1.0] * len(rows), [r[3] for r in rows]) for rows in images], **about
-    )
+    return perfect_predictions(images, **about)
 
 
 def complaint(*args):

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import rotation
 
 from kpbench.degrade.blurs import blur, motion_blur
 from kpbench.degrade.effects import dimming, noise
@@ -24,16 +25,11 @@ POSES = [
 ]
 
 
-def turn(deg):
-    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
-    return np.array([[c, -s], [s, c]])
-
-
 def placements(poses=POSES, black=40.0, white=215.0):
     placed = []
     for patch, (x, y, radius, tilt, first, second) in zip(shipped_patches(), poses, strict=False):
         H = np.eye(3)
-        H[:2, :2] = turn(first) @ np.diag([radius, radius * tilt]) @ turn(second)
+        H[:2, :2] = rotation(first) @ np.diag([radius, radius * tilt]) @ rotation(second)
         H[:2, 2] = x, y
         placed.append(Placement(patch, H, black, white))
     return placed
@@ -162,7 +158,7 @@ def test_a_design_whose_centre_looks_the_same_after_half_a_turn_is_found_in_ever
     find = TemplateDetector((patch,))
     for angle in range(10, 370, 30):
         H = np.eye(3)
-        H[:2, :2], H[:2, 2] = 25 * turn(angle), (60.2, 58.7)
+        H[:2, :2], H[:2, 2] = 25 * rotation(angle), (60.2, 58.7)
         background = procedural_background(np.random.default_rng(1), 120, 120)
         found = find(render_scene(background, [Placement(patch, H, 40.0, 215.0)]).image)
         assert np.hypot(*(found.xy - (60.2, 58.7)).T).min(initial=9) < 0.05, angle

@@ -1,6 +1,7 @@
 import cv2
 import numpy as np
 import pytest
+from helpers import rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,11 +16,6 @@ from kpbench.render.scene import render_scene
 
 PATCHES = shipped_patches()
 TEMPLATES = build_templates(PATCHES)
-
-
-def turn(deg):
-    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
-    return np.array([[c, -s], [s, c]])
 
 
 def render_design(number, A, xy, size=120):
@@ -39,7 +35,7 @@ def render_design(number, A, xy, size=120):
     off=st.tuples(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12)),
 )
 def test_any_pose_of_any_design_is_found_from_a_rough_place(number, radius, tilt, first, second, off):
-    xy, A = np.array([60.3, 59.6]), turn(first) @ np.diag([radius, radius * tilt]) @ turn(second)
+    xy, A = np.array([60.3, 59.6]), rotation(first) @ np.diag([radius, radius * tilt]) @ rotation(second)
     levels = build_pyramid(render_design(number, A, xy))
     short = radius * tilt * PATCHES[number].cells[0][1]
     coarse = int(np.clip(np.floor(np.log2(short / CORE_RADIUS_PX)), 0, 3))
@@ -88,7 +84,7 @@ def ellipse(A):
 @settings(deadline=None, max_examples=20)
 @given(number=st.integers(0, len(PATCHES) - 1), first=st.floats(0, 360), second=st.floats(0, 360))
 def test_a_design_is_turned_within_its_ellipse(number, first, second):
-    xy, A = np.array([60.3, 59.6]), turn(first) @ np.diag([24.0, 17.0]) @ turn(second)
+    xy, A = np.array([60.3, 59.6]), rotation(first) @ np.diag([24.0, 17.0]) @ rotation(second)
     levels = build_pyramid(render_design(number, A, xy))
     design = np.arange(len(PATCHES))
     rows, poses = rotate_within_ellipse(levels, np.tile(xy, (4, 1)), np.tile(ellipse(A), (4, 1, 1)), design, TEMPLATES)
@@ -119,7 +115,7 @@ def test_where_nothing_tells_two_rotations_apart_both_are_given():
     own = np.flatnonzero(whole.rotated_design == number)
     least = own[(whole.rotated[own] @ whole.rotated[own[0]]).argmin()]  # the most different one
     one, other = (
-        render_design(number, 18.0 * turn(np.degrees(whole.rotated_angle[n])), where).astype(float)
+        render_design(number, 18.0 * rotation(np.degrees(whole.rotated_angle[n])), where).astype(float)
         for n in (own[0], least)
     )
     xy, A, design = where[None], np.diag([18.0, 18.0])[None], np.array([number])
@@ -151,7 +147,7 @@ def test_blur_of_the_image_is_seen_in_the_frame_of_a_patch():
     side = VIEW_PX
     px = side / (2 * VIEW_REACH)  # of the view, in a radius
     axes = np.array([8.0, 20.0])
-    soft = blur_views(TEMPLATES.view, np.tile(turn(90) @ np.diag(axes), (len(PATCHES), 1, 1)), np.full(4, 2.0))
+    soft = blur_views(TEMPLATES.view, np.tile(rotation(90) @ np.diag(axes), (len(PATCHES), 1, 1)), np.full(4, 2.0))
     inner = slice(8, -8)  # the border of the view is not the same
     for before, after in zip(TEMPLATES.view.reshape(-1, side, side), soft.reshape(-1, side, side), strict=True):
         expected = cv2.GaussianBlur(before, (0, 0), 2.0 * px / axes[0], sigmaY=2.0 * px / axes[1])

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from helpers import rotation
 
 from kpbench.degrade.blurs import blur
 from kpbench.degrade.effects import noise
@@ -13,11 +14,6 @@ from kpbench.render.placement import Placement
 from kpbench.render.scene import render_scene
 
 PATCHES = shipped_patches()
-
-
-def turn(deg):
-    c, s = np.cos(np.radians(deg)), np.sin(np.radians(deg))
-    return np.array([[c, -s], [s, c]])
 
 
 def render_design(patch, A, xy, bend=(0.0, 0.0), size=90, background=120):
@@ -34,7 +30,7 @@ def fit_one(image, xy, A, patch):
 
 @pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.name)
 def test_a_clean_patch_is_fitted_exactly(patch):
-    xy, A = np.array([44.3, 45.8]), turn(25) @ np.diag([22.0, 13.0]) @ turn(70)
+    xy, A = np.array([44.3, 45.8]), rotation(25) @ np.diag([22.0, 13.0]) @ rotation(70)
     found = fit_one(
         render_design(patch, A, xy), xy + np.array([0.5, -0.4]), A @ np.array([[1.02, -0.01], [0.015, 1.01]]), patch
     )
@@ -47,7 +43,7 @@ def test_a_clean_patch_is_fitted_exactly(patch):
 
 @pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.name)
 def test_no_blur_moves_the_centre_and_its_width_is_found(patch):
-    xy, A = np.array([45.2, 44.6]), turn(10) @ np.diag([26.0, 20.0]) @ turn(140)
+    xy, A = np.array([45.2, 44.6]), rotation(10) @ np.diag([26.0, 20.0]) @ rotation(140)
     image = blur(render_design(patch, A, xy), 7)
     found = fit_one(image, xy + np.array([0.4, 0.3]), A, patch)
     assert np.hypot(*(found.xy[0] - xy)) < 0.03
@@ -56,7 +52,7 @@ def test_no_blur_moves_the_centre_and_its_width_is_found(patch):
 
 def test_perspective_moves_the_centre_of_no_ring():
     wheel = next(patch for patch in PATCHES if len(patch.cells[0]) > 2)
-    xy, A = np.array([45.2, 44.6]), turn(10) @ np.diag([34.0, 20.0]) @ turn(140)
+    xy, A = np.array([45.2, 44.6]), rotation(10) @ np.diag([34.0, 20.0]) @ rotation(140)
     found = fit_one(render_design(wheel, A, xy, bend=(0.06, -0.03)), xy, A, wheel)
     assert np.hypot(*(found.xy[0] - xy)) < 0.03
 
@@ -66,7 +62,7 @@ def test_the_error_is_near_the_bound_and_has_no_bias(number):
     """Twice the Cramér-Rao bound of 0.012 to 0.019 px (affine, perspective and inks unknown)."""
     patch, rng, errors = PATCHES[number], np.random.default_rng(number), []
     for _ in range(30):
-        xy, A = 30 + rng.uniform(-0.5, 0.5, 2), 12.0 * turn(rng.uniform(0, 360))
+        xy, A = 30 + rng.uniform(-0.5, 0.5, 2), 12.0 * rotation(rng.uniform(0, 360))
         image = noise(render_design(patch, A, xy, size=60), rng, 10)
         errors.append(fit_one(image, xy + rng.normal(0, 0.3, 2), A, patch).xy[0] - xy)
     assert np.sqrt(np.mean(np.square(errors))) < 0.038
@@ -74,7 +70,7 @@ def test_the_error_is_near_the_bound_and_has_no_bias(number):
 
 
 def test_the_wrong_design_fits_worse():
-    xy, A = np.array([44.3, 45.8]), 20.0 * turn(33)
+    xy, A = np.array([44.3, 45.8]), 20.0 * rotation(33)
     for n, patch in enumerate(PATCHES):
         fits = [fit_one(render_design(patch, A, xy), xy, A, other).ncc[0] for other in PATCHES]
         assert int(np.argmax(fits)) == n
@@ -82,7 +78,7 @@ def test_the_wrong_design_fits_worse():
 
 
 def test_a_patch_at_the_border_is_fitted_on_what_is_there():
-    xy, A = np.array([3.3, 40.2]), 20.0 * turn(15)
+    xy, A = np.array([3.3, 40.2]), 20.0 * rotation(15)
     found = fit_one(render_design(PATCHES[0], A, xy), xy + np.array([0.3, 0.3]), A, PATCHES[0])
     assert np.hypot(*(found.xy[0] - xy)) < 0.03
 
@@ -91,7 +87,7 @@ def test_a_wide_surround_on_any_texture_keeps_the_model_before_the_camera():
     rng, wide = np.random.default_rng(1), replace(PATCHES[0], rim=0.5, quiet_zone=1.5)
     levels = build_pyramid(procedural_background(rng, 320, 240), 0)
     xy, scale, angle = rng.uniform(60, 180, (40, 2)), rng.uniform(20, 60, 40), rng.uniform(0, 360, 40)
-    A = np.array([size * turn(deg) @ np.diag([1.0, 0.6]) for size, deg in zip(scale, angle, strict=True)])
+    A = np.array([size * rotation(deg) @ np.diag([1.0, 0.6]) for size, deg in zip(scale, angle, strict=True)])
     assert np.isfinite(fit(levels, xy, A, [wide] * 40).xy).all()
 
 
