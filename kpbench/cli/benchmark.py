@@ -26,9 +26,9 @@ from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
     type=click.Path(path_type=Path),
     default=Path("kpbench-bench"),
     show_default=True,
-    help="Folder for everything; what is done there is not done again.",
+    help="Folder for all files; finished work in it is kept.",
 )
-@click.option("--quick", is_flag=True, help="For a laptop: stands for --images 20 --size 640x480.")
+@click.option("--quick", is_flag=True, help="For a laptop: the same as --images 20 --size 640x480.")
 @click.option("--images", type=int, help="Base scenes, each seen with every board under every rung; default: 500.")
 @click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
 @ONLY
@@ -49,8 +49,8 @@ def bench(
 ) -> None:
     """Make the suites, run the detectors, score them, and set the tables beside the paper's.
 
-    Detectors of tags get boards of tags in the same scenes. An interrupted run is taken up by the same command.
-    Prints the tables as Markdown; writes the report of each suite, and the scores and predictions of each detector.
+    Detectors of tags get boards of tags in the same scenes. The same command continues an interrupted run. It prints
+    the tables as Markdown, and writes a report per suite, and the scores and predictions of each detector.
 
     \b
     Examples:

@@ -20,9 +20,9 @@ from kpbench.cli.score import FILE, scoring_options
 def compare(files: tuple[Path, ...], fail_on_regression: bool, **arguments: Any) -> None:
     """Compare the first of several predictions files with each of the others, on the same dataset.
 
-    Differences are paired: their 95 % intervals resample the scenes for both alike. With --fail-on-regression the exit
-    code is 1 if detection score, ID matching score or false alarms of the first are worse over all images and the
-    interval of the difference leaves out 0.
+    Differences are paired: each resample behind their 95 % intervals draws the same scenes for both detectors. With
+    --fail-on-regression the exit code is 1 if detection score, ID matching score or false alarms of the first are
+    worse over all images and the interval of the difference does not contain 0.
 
     \b
     Examples:

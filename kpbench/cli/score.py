@@ -1,4 +1,4 @@
-"""The command that scores a predictions file, and what it shares with the command that compares several."""
+"""The command that scores a predictions file, and the options that it shares with ``kpbench compare``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kpbench.cli.options import FileOfSuffix, Finite
 
 
 class Limit(click.ParamType[tuple[str, float]]):
-    """``METRIC=VALUE``, as a tuple; the metric must exist."""
+    """A limit ``METRIC=VALUE``, parsed into a tuple. The metric must exist."""
 
     name = "METRIC=VALUE"
 
@@ -46,30 +46,38 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that say what a match is, and against which truth."""
+    """Add the options of the truth, of a match and of the report to a command."""
     options = (
         click.option(
             "--gt",
             "truth",
             type=click.Path(path_type=Path),
-            help="Dataset, or COCO annotations (.json); else the one that the predictions name, else ./kpbench-data.",
+            help="Dataset or COCO annotations (.json); default: as the predictions name it, else ./kpbench-data.",
         ),
-        click.option("--eps", type=Finite(min=0), default=0.1, show_default=True, help="Reach of a match, in radii."),
+        click.option(
+            "--eps",
+            type=Finite(min=0),
+            default=0.1,
+            show_default=True,
+            help="Largest distance of a match, in radii of the keypoint.",
+        ),
         click.option(
             "--eps-radius",
             type=click.Choice(["major", "minor", "mean"]),
             default="major",
             show_default=True,
-            help="Which semi-axis of a tilted disc --eps is a share of.",
+            help="The radius of a tilted disc: its major or minor semi-axis, or half their sum.",
         ),
         click.option(
             "--matching",
             type=click.Choice(["one-to-one", "literal"]),
             default="one-to-one",
             show_default=True,
-            help="literal: the paper's formulas as printed, where several detections of a keypoint all count.",
+            help="literal: the paper's formulas as printed; several detections of a keypoint all count.",
         ),
-        click.option("--allow-missing", is_flag=True, help="An image without prediction has no detections."),
+        click.option(
+            "--allow-missing", is_flag=True, help="Take an image without prediction as an image without detections."
+        ),
         click.option(
             "--report",
             "report_file",
@@ -87,7 +95,9 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
 @scoring_options
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row per condition, rung and patch.")
-@click.option("--pose", is_flag=True, help="Errors of the board's pose too; for the datasets of a suite.")
+@click.option(
+    "--pose", is_flag=True, help="Compute errors of the board's pose too; the dataset must be that of a suite."
+)
 @click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
 @click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")
 def score(

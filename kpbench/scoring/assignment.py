@@ -256,7 +256,7 @@ def _assign_contested(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints)
     """Return the rows of those contested pairs that are matches."""
     t, d, distance = pairs
     xy, score = found.xy, found.score
-    # A keypoint alone with detections that reach no other keypoint takes the best of them
+    # If the detections near a keypoint are near no other keypoint, the keypoint takes the best of them
     entangled = np.isin(t, t[np.bincount(d)[d] > 1]) if len(d) else np.zeros(0, bool)
     star = np.flatnonzero(~entangled)
     won = [star[_first_of_each(t[star], -score[d[star]], distance[star], xy[d[star], 0], xy[d[star], 1])]]

@@ -25,11 +25,9 @@ from kpbench.types import Int
 
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)
 """Edges of the bins of radii, px: low < radius <= high."""
-_NEED_DETECTIONS = {"average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"} | {
-    "detections",
-    "duplicate",
-    "near_miss",
-    "clutter",
+_NEED_DETECTIONS = {
+    *("average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"),
+    *("detections", "duplicate", "near_miss", "clutter"),
 }
 """Metrics and counts that are undefined where detections cannot be divided among the groups."""
 _NEED_IDS = {"id_matching_score", "id_matching_score_literal", "id_correct", "wrong_id", "id_correct_literal"}

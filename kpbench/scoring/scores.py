@@ -226,9 +226,8 @@ def score(
 
     Notes
     -----
-    The paper's three metrics, written to be read. It tries every one-to-one assignment, so it is slow. A test holds
-    ``score`` equal to this code. The paper lets several detections of a keypoint count, so its detection score is at
-    least this one (`matching` "literal").
+    This function computes the paper's three metrics from one-to-one matching. It is written to be read and slow,
+    because it tries every assignment. A test checks that ``score`` gives the same numbers.
 
     >>> from itertools import permutations
     >>> from math import hypot
@@ -251,6 +250,9 @@ def score(
     ...         "id_matching_score": correct / matched if matched else None,
     ...         "average_false_alarm": (detections - matched) / len(images),
     ...     }
+
+    In the paper's own formulas several detections of one keypoint count. A detection score after these formulas,
+    `matching` "literal", is at least as high as the one above, and the average false alarm at most as high.
 
     Examples
     --------

@@ -1,5 +1,5 @@
 "use strict";
-// A click on a column's name sorts its table; a second one turns the order round. What has no number goes last.
+// A click on the name of a column sorts its table; a second click reverses the order. Rows without a value come last.
 for (const button of document.querySelectorAll("th button")) {
   button.addEventListener("click", () => {
     const th = button.parentElement, table = th.closest("table"), body = table.tBodies[0];
