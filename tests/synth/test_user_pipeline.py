@@ -6,8 +6,8 @@ from helpers import kpbench
 
 from kpbench.dataset.folder import open_dataset
 from kpbench.errors import DataError
-from kpbench.fitting import design_fit as refine
-from kpbench.fitting.pyramid import pyramid
+from kpbench.fitting import design_fit
+from kpbench.fitting.pyramid import build_pyramid
 from kpbench.patches.design import shipped_patches
 from kpbench.render.placement import Limits, random_placements
 from kpbench.render.scene import render_scene
@@ -49,7 +49,7 @@ def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
         carried = [placement for placement in moved if placement is not None]
         H = np.array([placement.H_patch2image for placement in carried])
         affine = H[:, :2, :2] - H[:, :2, 2:] @ H[:, 2:, :2]
-        fit = refine.fit(pyramid(image, 0), H[:, :2, 2], affine, [p.patch for p in carried])
+        fit = design_fit.fit(build_pyramid(image, 0), H[:, :2, 2], affine, [p.patch for p in carried])
         off.extend(np.linalg.norm(fit.xy - H[:, :2, 2], axis=1)[fit.ncc > 0.97])
     assert len(off) >= 6
     assert np.median(off) < 0.03
