@@ -32,12 +32,19 @@ import readers
 
 from kpbench.geometry import Line, flatten, move, rasterise
 from kpbench.patches import Patch, grid_board, hexagon_board, shipped_patches
-from kpbench.printing.dxf import to_dxf
-from kpbench.printing.page import Page, Shape
-from kpbench.printing.pdf import to_pdf
-from kpbench.printing.png import px_per_mm, to_png
-from kpbench.printing.sheet import PageFormat, Sheet, board_sheet, patch_sheet
-from kpbench.printing.svg import to_svg
+from kpbench.printing import (
+    Page,
+    PageFormat,
+    Shape,
+    Sheet,
+    board_sheet,
+    patch_sheet,
+    px_per_mm,
+    to_dxf,
+    to_pdf,
+    to_png,
+    to_svg,
+)
 from kpbench.types import Float
 
 Image.MAX_IMAGE_PIXELS = None

@@ -99,8 +99,8 @@ def render_patches(
     from kpbench.cli.progress import progress_bar
     from kpbench.patches.board import DEFAULT_DIAMETER_MM, find_patch
     from kpbench.patches.design import load_patches, shipped_patches
+    from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
-    from kpbench.printing.sheet import parse_page_format
     from kpbench.printing.sidecar import correct_sidecars
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}

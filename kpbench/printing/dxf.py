@@ -1,4 +1,8 @@
-"""ASCII DXF of AutoCAD 2000, for laser and plotter: arcs exact as bulges of closed polylines."""
+"""ASCII DXF of AutoCAD 2000 for laser and plotter, with exact arcs.
+
+The group codes, and the tables that readers insist on, are those of Autodesk's *DXF Reference*. A tag is a pair (group
+code, value). The frame of DXF has **y up** and its origin at the bottom-left corner of the page.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,19 @@ from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
 
 
 def to_dxf(page: Page) -> bytes:
-    """The page as ASCII DXF of AutoCAD 2000, in mm, arcs exact as bulges of closed polylines.
+    """Return the page as DXF in mm. Contours are closed polylines whose arcs are exact bulges.
 
-    The frame is DXF's: **y up**, the origin is the page's bottom-left corner, so y is ``height - y`` of
-    the page frame. Group codes and the tables that a reader insists on: Autodesk, *DXF Reference*.
+    Parameters
+    ----------
+    page : Page
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Page, Shape, to_dxf
+    >>> page = Page(40.0, 40.0, (Shape(circle(20.0, 20.0, 15.0)),), (), "a disc")
+    >>> to_dxf(page).count(b'LWPOLYLINE')
+    1
     """
     handle = iter(range(0x100, 0x7FFFFFFF))
     body: list[tuple[int, Any]] = []
@@ -37,13 +50,13 @@ def _dxf_value(value: Any) -> str:
 
 
 def _dxf_text(text: str) -> str:
-    """DXF escapes what is not in the code page, and reads ``%%`` as a control code."""
+    """Return the text with escapes for characters outside ASCII, and without ``%%``, which is a control code."""
     units = "".join(c if c.isascii() else f"\\U+{ord(c):04X}" for c in text if ord(c) < 0x10000)
     return units.replace("%%", "% %")
 
 
 def _dxf_vertices(contour: Contour, height: float) -> list[tuple[int, Any]]:
-    """Vertices with bulge = tan(sweep / 4); y up makes a positive sweep run clockwise, which is negative."""
+    """Return the vertices of a contour. An arc has the bulge ``-tan(sweep / 4)``, as y points up in DXF."""
     parts = [piece for part in contour for piece in split_arc(part, 180.0)]
     tags: list[tuple[int, Any]] = [(90, len(parts)), (70, 1), (43, 0.0)]
     for part in parts:
@@ -63,7 +76,7 @@ def _dxf_table(name: str, handle: str, entries: Sequence[Sequence[tuple[int, Any
 
 
 def _dxf_head(page: Page, next_handle: int) -> list[tuple[int, Any]]:
-    """Header, tables and blocks, up to the entities."""
+    """Return the header, the tables and the blocks, which stand before the entities."""
 
     def record(kind: str, handle: str, owner: str, sub: str, name: str, *rest: tuple[int, Any]) -> list[Any]:
         table_record = (100, "AcDbSymbolTableRecord")

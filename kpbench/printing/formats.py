@@ -1,4 +1,4 @@
-"""Which writer makes the file of which suffix."""
+"""Table of the print formats: suffix of the file to its writer."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from kpbench.printing.pdf import to_pdf
 from kpbench.printing.png import to_png
 from kpbench.printing.svg import to_svg
 
-WRITERS: dict[str, Callable[[Sequence[Page], float], list[bytes]]] = {
+PAGE_WRITERS: dict[str, Callable[[Sequence[Page], float], list[bytes]]] = {
     ".svg": lambda pages, dpi: [to_svg(page) for page in pages],
     ".png": lambda pages, dpi: [to_png(page, dpi) for page in pages],
     ".pdf": lambda pages, dpi: [to_pdf(pages)],
     ".dxf": lambda pages, dpi: [to_dxf(page) for page in pages],
 }
-"""Suffix to (pages, dpi) -> the contents of the files: one for PDF, one a page for the others."""
+"""Suffix to a function (pages, dpi) -> contents of the files. PDF has one file, other formats one file per page."""

@@ -1,13 +1,12 @@
-"""Pages of exact outlines in mm, written as SVG, PDF, PNG or DXF.
+"""Pages of exact outlines in mm, which the writers turn into SVG, PDF, PNG or DXF.
 
-Page frame: mm, x right, y down, the origin is the page's top-left corner. Every shape is an outline of
-straight lines and circular arcs that is filled black and never stroked, so no format makes an edge
-fatter. What the shapes mean is the caller's business.
+Page frame: mm, x right, y down. The origin is the top-left corner of the page. A shape is an outline of straight lines
+and circular arcs, filled black. Shapes are never stroked: a stroke would make them larger.
 
 Layers
 ------
-``INK`` and ``MARKS`` are printed. ``CUT`` is where a knife or laser should go: it is drawn in DXF only,
-since a printed line would touch what it cuts out.
+``INK`` and ``MARKS`` are printed. ``CUT`` is the path of a knife or laser. Only DXF contains this layer: a printed line
+would touch the part that is cut out.
 """
 
 from __future__ import annotations
@@ -24,7 +23,22 @@ LAYERS = (INK, MARKS, CUT)
 
 @dataclass(frozen=True)
 class Shape:
-    """A filled region of the page frame, in mm, on one of the :data:`LAYERS`."""
+    """A filled region of a page.
+
+    Attributes
+    ----------
+    region : tuple of contours
+        Outline in mm of the page frame, such as :func:`kpbench.geometry.circle`.
+    layer : str
+        "INK", "MARKS" or "CUT".
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Shape
+    >>> Shape(circle(20.0, 20.0, 15.0)).layer
+    'INK'
+    """
 
     region: Region
     layer: str = INK
@@ -32,7 +46,26 @@ class Shape:
 
 @dataclass(frozen=True)
 class Text:
-    """One line of text: baseline point and font size in mm; ``anchor`` is start, middle or end."""
+    """A line of text.
+
+    Attributes
+    ----------
+    text : str
+    x, y : float
+        Point on the baseline, mm.
+    size : float
+        Font size, mm.
+    anchor : str
+        Part of the text that lies at the point: "start", "middle" or "end".
+    mirrored : bool
+        Whether the letters are mirrored.
+
+    Examples
+    --------
+    >>> from kpbench.printing import Text
+    >>> Text("print at 100 %", x=10.0, y=10.0, size=2.2).clean
+    'print at 100 %'
+    """
 
     text: str
     x: float
@@ -43,13 +76,30 @@ class Text:
 
     @property
     def clean(self) -> str:
-        """The text without control characters, which no format can hold."""
+        """The text with a question mark in place of each control character: no format can hold those."""
         return "".join(c if c.isprintable() else "?" for c in self.text)
 
 
 @dataclass(frozen=True)
 class Page:
-    """One page, sizes in mm."""
+    """A page with its shapes and texts.
+
+    Attributes
+    ----------
+    width, height : float
+        Size, mm.
+    shapes : tuple of Shape
+    texts : tuple of Text
+    title : str
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Page, Shape
+    >>> page = Page(40.0, 40.0, (Shape(circle(20.0, 20.0, 15.0)),), (), "a disc")
+    >>> len(page.shapes)
+    1
+    """
 
     width: float
     height: float
@@ -58,27 +108,32 @@ class Page:
     title: str
 
 
-def mirror(page: Page) -> Page:
-    """The page as a mirror shows it, left and right swapped, for transfer film."""
+def round_to_nm(value: float) -> float:
+    """Return millimetres rounded to 1 nm, so that files hold no noise of floating point."""
+    return round(value, 6) + 0.0
+
+
+def mirror_page(page: Page) -> Page:
+    """Return the page with left and right swapped, for transfer film."""
     width = page.width
 
-    def flipped(part: Line | Arc) -> Line | Arc:
+    def flip(part: Line | Arc) -> Line | Arc:
         if isinstance(part, Line):
             return Line(width - part.x0, part.y0, width - part.x1, part.y1)
         return Arc(width - part.x, part.y, part.radius, 180.0 - part.start_deg, -part.sweep_deg)
 
-    shapes = tuple(Shape(tuple(tuple(map(flipped, c)) for c in s.region), s.layer) for s in page.shapes)
+    shapes = tuple(Shape(tuple(tuple(map(flip, c)) for c in s.region), s.layer) for s in page.shapes)
     texts = tuple(Text(t.text, width - t.x, t.y, t.size, t.anchor, not t.mirrored) for t in page.texts)
     return Page(width, page.height, shapes, texts, page.title)
 
 
 def start_point(part: Line | Arc) -> tuple[float, float]:
-    """Return where a segment begins, in mm."""
+    """Return the first point of a segment."""
     return (part.x0, part.y0) if isinstance(part, Line) else part.point(0.0)
 
 
 def split_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
-    """The segment itself, or its arc cut into equal arcs of at most ``max_deg``."""
+    """Return a line as it is, or the equal arcs of at most ``max_deg`` that make up an arc."""
     if isinstance(part, Line):
         return (part,)
     count = math.ceil(abs(part.sweep_deg) / max_deg - 1e-9)
@@ -87,5 +142,5 @@ def split_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
 
 
 def split_arcs(region: Region, max_deg: float) -> list[list[Line | Arc]]:
-    """Return the contours of a region with each arc cut into equal arcs of at most ``max_deg``."""
+    """Return the contours of a region with each arc split into equal arcs of at most ``max_deg``."""
     return [[piece for part in contour for piece in split_arc(part, max_deg)] for contour in region]

@@ -1,4 +1,4 @@
-"""PDF: filled paths, an embedded font, and a request to the viewer not to scale."""
+"""PDF with filled paths, an embedded font, and a request to the viewer not to scale."""
 
 from __future__ import annotations
 
@@ -10,17 +10,28 @@ from typing import Any
 from kpbench.geometry.outline import Line, Region
 from kpbench.printing.page import CUT, Page, split_arcs, start_point
 
-PDF_FONT = "Vera"  # comes with reportlab, may be embedded freely
-
-
+PDF_FONT = "Vera"  # ships with reportlab; its licence permits embedding
 PT_PER_MM = 72 / 25.4
+LONGEST_ARC_DEG = 22.5  # of one Bézier curve, whose edge is then off by less than 1e-7 of the radius
 
 
 def to_pdf(pages: Sequence[Page]) -> bytes:
-    """All pages as one PDF: filled paths only, text in an embedded font, and a request to the viewer not to scale.
+    """Return all pages as one PDF.
 
-    An arc becomes cubic Béziers of at most 22.5 degrees, with control points at ``4/3 tan(sweep/4)``
-    radii along the tangents; the edge is then off by less than 1e-7 of the radius.
+    An arc becomes cubic Bézier curves of at most :data:`LONGEST_ARC_DEG`. The control points lie on the tangents at the
+    ends, at a distance of ``4/3 tan(sweep / 4)`` radii.
+
+    Parameters
+    ----------
+    pages : sequence of Page
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Page, Shape, to_pdf
+    >>> page = Page(40.0, 40.0, (Shape(circle(20.0, 20.0, 15.0)),), (), "a disc")
+    >>> to_pdf([page]).startswith(b'%PDF')
+    True
     """
     from reportlab.pdfbase import pdfmetrics
     from reportlab.pdfbase.ttfonts import TTFont
@@ -60,7 +71,7 @@ def _pdf_path(path: Any, region: Region, height_pt: float) -> Any:
     def pt(x: float, y: float) -> tuple[float, float]:
         return x * PT_PER_MM, height_pt - y * PT_PER_MM
 
-    for contour in split_arcs(region, 22.5):
+    for contour in split_arcs(region, LONGEST_ARC_DEG):
         path.moveTo(*pt(*start_point(contour[0])))
         for part, after in zip(contour, contour[1:] + contour[:1], strict=True):
             if isinstance(part, Line):

@@ -1,4 +1,4 @@
-"""PNG: every pixel grey by the exact area that ink covers, with its resolution inside."""
+"""PNG whose pixels are grey by the exact area that ink covers; the file contains its resolution."""
 
 from __future__ import annotations
 
@@ -16,20 +16,41 @@ MAX_PIXELS = 1_000_000_000
 
 
 def px_per_mm(dpi: float) -> float:
-    """Pixels per mm of a PNG: a PNG holds whole pixels per metre, and that is the scale it is drawn at."""
+    """Return the pixels per mm of a PNG. The file holds whole pixels per metre, and the page is drawn at that scale.
+
+    Examples
+    --------
+    >>> from kpbench.printing import px_per_mm
+    >>> px_per_mm(dpi=300)
+    11.811
+    """
     return round(dpi / 0.0254) / 1000
 
 
 def to_png(page: Page, dpi: float) -> bytes:
-    """The page as 8-bit grey PNG, every pixel grey by the exact area that ink covers.
+    """Return the page as 8-bit grey PNG.
 
-    The page's top-left corner is the corner of the first pixel, hence a point (x, y) in mm lies at
+    The top-left corner of the page is the corner of the first pixel. A coordinate x in mm therefore is
     ``x * px_per_mm(dpi) - 0.5`` px.
+
+    Parameters
+    ----------
+    page : Page
+    dpi : float
+        Pixels per inch.
 
     Raises
     ------
     DesignError
-        If the image would have more than :data:`MAX_PIXELS`.
+        If the image would have more than :data:`MAX_PIXELS` pixels.
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Page, Shape, to_png
+    >>> page = Page(40.0, 40.0, (Shape(circle(20.0, 20.0, 15.0)),), (), "a disc")
+    >>> to_png(page, dpi=300)[1:4]
+    b'PNG'
     """
     from PIL import Image
 
@@ -44,7 +65,7 @@ def to_png(page: Page, dpi: float) -> bytes:
     paper = np.full((height, width), 255, np.uint8)
 
     def ink(x: int, y: int, covered: NDArray[np.float64]) -> None:
-        """Darken the paper; where two shapes share a pixel their areas add up."""
+        """Darken the paper. The areas of shapes that share a pixel add up."""
         rows, columns = slice(max(y, 0), y + covered.shape[0]), slice(max(x, 0), x + covered.shape[1])
         below = paper[rows, columns]
         part = covered[rows.start - y :, columns.start - x :][: below.shape[0], : below.shape[1]]
@@ -64,11 +85,11 @@ def to_png(page: Page, dpi: float) -> bytes:
 
 
 def _letters(text: Text, scale: float) -> tuple[NDArray[np.float64], float, float]:
-    """Coverage of a line of text, and where its first pixel lies relative to the baseline point, in px."""
+    """Return the coverage of a line of text, and the px from its baseline point to the first column and row."""
     from PIL import Image, ImageDraw, ImageFont
 
     font = ImageFont.load_default(max(text.size * scale, 1.0))
-    line = text.clean.encode("ascii", "replace").decode()  # all that the built-in font knows
+    line = text.clean.encode("ascii", "replace").decode()  # the built-in font has no other characters
     anchor = {"start": "ls", "middle": "ms", "end": "rs"}[text.anchor]
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), line, font, anchor)
     image = Image.new("L", (max(math.ceil(right - left), 1), max(math.ceil(bottom - top), 1)))

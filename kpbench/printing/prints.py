@@ -1,23 +1,20 @@
-"""Print files of patches and boards: lay out the sheets, then write them with their sidecars."""
+"""Prints of patches and boards: lay out the sheets, then write their files and sidecars."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from kpbench.errors import DesignError
+from kpbench.files import make_folder, write_atomic
 from kpbench.patches.board import DEFAULT_DIAMETER_MM, Board
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.printing.formats import WRITERS
-from kpbench.printing.sheet import (
-    PageFormat,
-    Sheet,
-    board_sheet,
-    file_stem,
-    parse_page_format,
-    patch_sheet,
-    save_sheet,
-)
+from kpbench.printing.formats import PAGE_WRITERS
+from kpbench.printing.page_format import PageFormat, parse_page_format
+from kpbench.printing.png import px_per_mm
+from kpbench.printing.sheet import Sheet, board_sheet, patch_sheet
 
 Progress = Callable[[int], None]
 
@@ -33,26 +30,26 @@ def print_patches(
     dpi: float = 600,
     progress: Progress = lambda sheets: None,
 ) -> list[Path]:
-    """Write print files of patches to cut out, and a sidecar with the position of every keypoint.
+    """Write prints of patches to cut out, and a sidecar with the position of every keypoint.
 
     Parameters
     ----------
     patches : sequence of Patch, optional
-        Default: the shipped four.
+        The four shipped designs if left out.
     out : str or Path
         Folder; made if missing.
     diameter_mm : float
-        Diameter of the unit disc. Rims and quiet zones are added to it.
+        Diameter of the discs. Rim and quiet zone lie around the disc.
     copies : int
         Number of copies of each patch.
     page : str or PageFormat
-        Such as ``"a4"`` or ``"200x300mm"``, see :func:`kpbench.printing.parse_page_format`.
+        Such as "a4" or "200x300mm", see :func:`kpbench.printing.parse_page_format`.
     formats : sequence of str
-        Among ``"pdf"``, ``"svg"``, ``"png"`` and ``"dxf"``.
+        Some of "pdf", "svg", "png" and "dxf".
     dpi : float
         Resolution of PNG.
     progress : callable
-        Called with the number of sheets that were written since its last call.
+        Called with the number of sheets that were written since the call before.
 
     Returns
     -------
@@ -62,7 +59,7 @@ def print_patches(
     Raises
     ------
     DesignError
-        If a patch does not fit the page, or a format or page is unknown.
+        If a patch does not fit the page, or the format of a file or page is unknown.
     DataError
         If a file cannot be written.
 
@@ -86,27 +83,28 @@ def print_boards(
     dpi: float = 600,
     progress: Progress = lambda sheets: None,
 ) -> list[Path]:
-    """Write print files of boards, and for each board a sidecar with the position of every keypoint.
+    """Write prints of boards, and for each board a sidecar with the position of every keypoint.
 
-    Nothing is written unless every board fits.
+    No file is written unless every board fits its page.
 
     Parameters
     ----------
     boards : sequence of Board
     tile : bool
-        Whether a board that is larger than the page is spread over several pages.
+        Whether a board that is larger than the page may be spread over several pages.
     out, page, formats, dpi, progress
         As for :func:`print_patches`.
 
     Returns
     -------
     list of Path
-        The files that were written, for each board its sidecar last.
+        The files that were written. The sidecar is the last file of each board.
 
     Raises
     ------
     DesignError
-        If a board does not fit the page, two boards have the same file name, or a format or page is unknown.
+        If a board does not fit the page, two boards have the same file name, or the format of a file or page is
+        unknown.
     DataError
         If a file cannot be written.
 
@@ -132,8 +130,7 @@ def _page_format(page: str | PageFormat) -> PageFormat:
 def _save_sheets(
     sheets: Sequence[Sheet], out: str | Path, formats: Sequence[str], dpi: float, progress: Progress
 ) -> list[Path]:
-    """Write sheets in every format."""
-    known = [suffix.removeprefix(".") for suffix in WRITERS]
+    known = [suffix.removeprefix(".") for suffix in PAGE_WRITERS]
     for name in formats:
         if name not in known:
             raise DesignError(f"`formats` has {name!r}, expected some of: {', '.join(known)}")
@@ -142,3 +139,58 @@ def _save_sheets(
         files += save_sheet(sheet, out, [f".{name}" for name in formats], dpi)
         progress(1)
     return files
+
+
+def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: float = 600) -> list[Path]:
+    """Write a sheet in several formats, and its sidecar.
+
+    Files are ``NAME.suffix``. A format with one page per file gives ``NAME-1.suffix``, ``NAME-2.suffix``, … for several
+    pages.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    folder : str or Path
+        Made if missing.
+    suffixes : sequence of str
+        Some of ".pdf", ".svg", ".png", ".dxf".
+    dpi : float
+        Resolution of PNG.
+
+    Returns
+    -------
+    list of Path
+        The files that were written, the sidecar last.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be written.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.printing import PageFormat, patch_sheet, save_sheet
+    >>> sheet = patch_sheet(kpbench.shipped_patches(), 100.0, PageFormat(210, 297))
+    >>> [path.name for path in save_sheet(sheet, "print", [".svg"])]
+    ['patches-1.svg', 'patches-2.svg', 'patches.json']
+    """
+    folder = make_folder(Path(folder))
+    stem = file_stem(sheet.name)
+    sidecar = dict(sheet.sidecar)
+    if ".png" in suffixes:
+        sidecar["png"] = {"dpi": dpi, "px_per_mm": px_per_mm(dpi)}
+    written = []
+    for suffix in suffixes:
+        contents = PAGE_WRITERS[suffix](sheet.pages, dpi)
+        for n, content in enumerate(contents, 1):
+            written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
+            write_atomic(written[-1], content)
+    written.append(folder / f"{stem}.json")
+    write_atomic(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
+    return written
+
+
+def file_stem(name: str) -> str:
+    """Return a file name for a board: letters, digits, ``_``, ``.`` and ``-`` stay, other characters become ``-``."""
+    return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "board"

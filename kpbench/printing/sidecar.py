@@ -1,42 +1,88 @@
-"""Sidecars: where the keypoints of a printed sheet or board are, as JSON beside the print.
+"""Sidecars: JSON files beside a print that list the position of every keypoint.
 
-``kpbench.board/1`` has positions in the board frame (for ``cv2.solvePnP``) and on the page;
-``kpbench.sheet/1``, of patches to be cut out, on the page only. ``docs/howto/print.md`` lists the fields.
+``kpbench.board/1`` lists positions in the board frame (for ``cv2.solvePnP``) and on the page. ``kpbench.sheet/1`` is of
+patches to be cut out, and lists positions on the page only. The documentation of printing lists the fields.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from kpbench import __version__
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
+from kpbench.patches.design import Patch
+from kpbench.printing.page import round_to_nm
+from kpbench.printing.page_format import PageFormat
 
 BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
+LARGEST_ERROR = 0.1  # a ruler that is off by a larger fraction was measured wrongly
 
 
-def nm(value: float) -> float:
-    """Millimetres to 1 nm, so that a sidecar holds no float noise."""
-    return round(value, 6) + 0.0
+def sidecar_head(
+    schema: str, name: str, digest: str, page_format: PageFormat, patches: Iterable[Patch]
+) -> dict[str, Any]:
+    """Return the fields that the sidecars of boards and of sheets share."""
+    return {
+        "schema": schema,
+        "kpbench": __version__,
+        "name": name,
+        "digest": digest,
+        "page_mm": [page_format.width_mm, page_format.height_mm],
+        "mirrored": page_format.mirrored,
+        "ruler_mm": list(page_format.rulers_mm),
+        "print_scale": [1.0, 1.0],
+        "patches": [{"id": p.patch_id, "name": p.name, "digest": p.digest} for p in patches],
+    }
+
+
+def sidecar_entry(
+    index: int, patch: Patch, rotate_deg: float, diameter_mm: float, page: int, on_paper: tuple[float, float]
+) -> dict[str, Any]:
+    """Return the entry of one keypoint; pages count from 1."""
+    return {
+        "index": index,
+        "patch_id": patch.patch_id,
+        "rotate_deg": rotate_deg,
+        "diameter_mm": round_to_nm(diameter_mm),
+        "page": page,
+        "page_x_mm": on_paper[0],
+        "page_y_mm": on_paper[1],
+    }
 
 
 def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> list[Path]:
-    """Write ``NAME.measured.json`` beside each sidecar of a folder: positions as the printer made them.
+    """Write ``NAME.measured.json`` beside each sidecar of a folder, with the lengths that the printer produced.
 
     Parameters
     ----------
-    folder : path
-    measured_mm : (x, y)
-        Lengths in mm of the two rulers as measured on the paper.
+    folder : str or Path
+        Folder with sidecars, such as :func:`print_patches` writes.
+    measured_mm : (float, float)
+        Lengths of the x ruler and of the y ruler, measured on the paper.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
 
     Raises
     ------
     DesignError
-        If the folder holds no sidecar, or a length is more than a tenth off.
+        If the folder holds no sidecar, a sidecar is incomplete, or a length is more than a tenth off.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.printing import correct_sidecars
+    >>> _ = kpbench.print_patches(out="print")
+    >>> [path.name for path in correct_sidecars("print", (99.8, 100.1))]
+    ['patches.measured.json']
     """
     written = []
     for path in sorted(Path(folder).glob("*.json")):
@@ -46,7 +92,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
             sidecar = json.loads(path.read_bytes())
             if not isinstance(sidecar, dict) or sidecar.get("schema") not in (BOARD_SCHEMA, SHEET_SCHEMA):
                 continue
-            content = json.dumps(corrected(sidecar, measured_mm, str(path)), indent=1) + "\n"
+            content = json.dumps(correct_sidecar(sidecar, measured_mm, str(path)), indent=1) + "\n"
             written.append(path.with_suffix(".measured.json"))
             write_atomic(written[-1], content.encode())
         except (KeyError, TypeError, ValueError) as error:
@@ -58,26 +104,28 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     return written
 
 
-def corrected(sidecar: Mapping[str, Any], measured_mm: tuple[float, float], source: str = "sidecar") -> dict[str, Any]:
-    """The sidecar with its lengths in mm as measured; page positions stay those of the file.
+def correct_sidecar(
+    sidecar: Mapping[str, Any], measured_mm: tuple[float, float], source: str = "sidecar"
+) -> dict[str, Any]:
+    """Return the sidecar with the lengths that the printer produced; positions on the page stay those of the file.
 
-    A disc whose x and y scales differ is an ellipse: its diameter becomes the geometric mean.
+    A disc with different scales in x and y is an ellipse. Its diameter becomes the geometric mean of both.
     """
     scale = [measured / nominal for measured, nominal in zip(measured_mm, sidecar["ruler_mm"], strict=True)]
     for axis, s, measured, nominal in zip("xy", scale, measured_mm, sidecar["ruler_mm"], strict=True):
-        if not 0.9 <= s <= 1.1:
+        if not 1 - LARGEST_ERROR <= s <= 1 + LARGEST_ERROR:
             raise DesignError(
                 f"{source}: the {axis} ruler is {nominal:g} mm, but {measured:g} mm was measured; "
                 f"expected {0.9 * nominal:g} to {1.1 * nominal:g}"
             )
     x, y = scale
 
-    def scaled(entry: Mapping[str, Any]) -> dict[str, Any]:
+    def correct(entry: Mapping[str, Any]) -> dict[str, Any]:
         factor = {"x_mm": x, "y_mm": y, "diameter_mm": math.sqrt(x * y)}
-        return {key: nm(value * factor[key]) if key in factor else value for key, value in entry.items()}
+        return {key: round_to_nm(value * factor[key]) if key in factor else value for key, value in entry.items()}
 
-    result = dict(sidecar) | {"print_scale": scale, "keypoints": [scaled(k) for k in sidecar["keypoints"]]}
+    result = dict(sidecar) | {"print_scale": scale, "keypoints": [correct(k) for k in sidecar["keypoints"]]}
     if "side_mm" in sidecar:
-        result["side_mm"] = [nm(side * s) for side, s in zip(sidecar["side_mm"], scale, strict=True)]
-        result["tiles"] = [t | {"corners": [scaled(c) for c in t["corners"]]} for t in sidecar["tiles"]]
+        result["side_mm"] = [round_to_nm(side * s) for side, s in zip(sidecar["side_mm"], scale, strict=True)]
+        result["tiles"] = [t | {"corners": [correct(c) for c in t["corners"]]} for t in sidecar["tiles"]]
     return result

@@ -5,18 +5,18 @@ from __future__ import annotations
 from xml.sax.saxutils import escape
 
 from kpbench.geometry.outline import Line, Region
-from kpbench.printing.page import INK, MARKS, Page, Text, split_arcs, start_point
+from kpbench.printing.page import INK, MARKS, Page, Text, round_to_nm, split_arcs, start_point
 
 SVG_FONTS = "Helvetica, Arial, sans-serif"
 
 
 def _mm(*values: float) -> str:
-    """Numbers to 1 nm, without trailing zeros."""
-    return " ".join(f"{round(v, 6) + 0.0:.6f}".rstrip("0").rstrip(".") for v in values)
+    """Return numbers rounded to 1 nm, without trailing zeros."""
+    return " ".join(f"{round_to_nm(v):.6f}".rstrip("0").rstrip(".") for v in values)
 
 
 def _svg_path(region: Region) -> str:
-    """Path data. Arcs are at most 90 degrees: in longer ones the rounding of the ends moves the centre."""
+    """Return path data. Arcs cover at most 90 degrees: rounded ends would move the centres of longer arcs."""
     data = []
     for contour in split_arcs(region, 90.0):
         data.append("M" + _mm(*start_point(contour[0])))
@@ -31,7 +31,20 @@ def _svg_path(region: Region) -> str:
 
 
 def to_svg(page: Page) -> bytes:
-    """The page as SVG, in mm, with true arcs."""
+    """Return the page as SVG, in mm, with true arcs.
+
+    Parameters
+    ----------
+    page : Page
+
+    Examples
+    --------
+    >>> from kpbench.geometry import circle
+    >>> from kpbench.printing import Page, Shape, to_svg
+    >>> page = Page(40.0, 40.0, (Shape(circle(20.0, 20.0, 15.0)),), (), "a disc")
+    >>> to_svg(page).startswith(b'<?xml')
+    True
+    """
     size = f'width="{_mm(page.width)}mm" height="{_mm(page.height)}mm" viewBox="0 0 {_mm(page.width, page.height)}"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
     lines.append(f"<title>{escape(Text(page.title, 0, 0, 0).clean)}</title>")

@@ -1,4 +1,4 @@
-"""A board cut into page-sized tiles, along straight seams that pass between patches."""
+"""Tiles: a board cut into pieces of the size of a page, along straight seams that pass between patches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from kpbench.errors import DesignError
 from kpbench.patches.board import Board
 
-SEAM_CLEARANCE = 1.0  # mm between a seam and any patch: what a careful cut with a knife needs
+SEAM_CLEARANCE = 1.0  # mm, between a seam and any patch: enough for a careful cut with a knife
 
 
 @dataclass(frozen=True)
 class Tile:
-    """One tile: its place in the tiling from 0, and its window in mm of the board frame."""
+    """A tile: its row and column, both from 0, and its window in mm of the board frame."""
 
     row: int
     column: int
@@ -24,16 +24,16 @@ class Tile:
 
     @property
     def corners(self) -> list[tuple[float, float]]:
-        """The window's corners in mm of the board frame: top left, top right, bottom left, bottom right."""
+        """Corners of the window in mm of the board frame: top left, top right, bottom left, bottom right."""
         return [(x, y) for y in (self.y0, self.y1) for x in (self.x0, self.x1)]
 
-    def holds(self, x_mm: float, y_mm: float) -> bool:
-        """Whether a point of the board lies in the window; a seam belongs to the tile after it."""
+    def contains(self, x_mm: float, y_mm: float) -> bool:
+        """Return whether a point of the board lies in the window; a seam belongs to the tile on its right or below."""
         return self.x0 <= x_mm < self.x1 and self.y0 <= y_mm < self.y1
 
 
-def cut_into_tiles(board: Board, room_x_mm: float, room_y_mm: float) -> list[Tile]:
-    """As few tiles of at most the given size as hold the board, row by row; one if it fits.
+def cut_into_tiles(board: Board, width_mm: float, height_mm: float) -> list[Tile]:
+    """Cut a board into the least number of tiles of at most a given size, listed row by row.
 
     Raises
     ------
@@ -41,15 +41,15 @@ def cut_into_tiles(board: Board, room_x_mm: float, room_y_mm: float) -> list[Til
         If no straight seam passes between the patches.
     """
     cuts = []
-    for side, room, spans in (
-        (board.side_x_mm, room_x_mm, [(k.x_mm - k.extent_mm, k.x_mm + k.extent_mm) for k in board.keypoints]),
-        (board.side_y_mm, room_y_mm, [(k.y_mm - k.extent_mm, k.y_mm + k.extent_mm) for k in board.keypoints]),
+    for side, longest, spans in (
+        (board.side_x_mm, width_mm, [(k.x_mm - k.extent_mm, k.x_mm + k.extent_mm) for k in board.keypoints]),
+        (board.side_y_mm, height_mm, [(k.y_mm - k.extent_mm, k.y_mm + k.extent_mm) for k in board.keypoints]),
     ):
-        found = _seams(spans, side, room)
+        found = _seams(spans, side, longest)
         if found is None:
             raise DesignError(
                 f"board {board.name!r} cannot be tiled: no straight seam passes between its patches within the "
-                f"{room:g} mm that a page holds; use a larger page or smaller patches"
+                f"{longest:g} mm that a page holds; use a larger page or smaller patches"
             )
         cuts.append(found)
     xs, ys = cuts
@@ -60,21 +60,26 @@ def cut_into_tiles(board: Board, room_x_mm: float, room_y_mm: float) -> list[Til
     ]
 
 
-def _seams(spans: Sequence[tuple[float, float]], side: float, room: float) -> list[float] | None:
-    """Ends and seams along one axis: as few pieces of at most ``room`` as can be, cut amid the gaps."""
+def _seams(spans: Sequence[tuple[float, float]], side: float, longest: float) -> list[float] | None:
+    """Return both ends and the seams along one axis, for the least number of pieces of at most ``longest``.
+
+    ``spans`` are the extents of the patches along the axis. Seams lie in the middle of the gaps between patches where
+    that is possible. None means that no seam passes.
+    """
     blocked = sorted(((low - SEAM_CLEARANCE, high + SEAM_CLEARANCE) for low, high in spans), key=lambda b: -b[1])
     cuts = [-side / 2]
-    while side / 2 - cuts[-1] > room + 1e-6:
-        seam = cuts[-1] + room
-        for low, high in blocked:  # from the far end inwards, so that one pass is enough
+    while side / 2 - cuts[-1] > longest + 1e-6:
+        seam = cuts[-1] + longest
+        for low, high in blocked:  # sorted from the far end: one pass is enough
             if low < seam < high:
                 seam = low
         if seam <= cuts[-1]:
             return None
         cuts.append(seam)
     cuts.append(side / 2)
-    for n in range(1, len(cuts) - 1):  # every seam is as far along as it can be; most may step back
+    # so far every seam is as far from the start as possible; move the seams back to the middle of their gaps
+    for n in range(1, len(cuts) - 1):
         before = max((high for _, high in blocked if high <= cuts[n]), default=-side / 2)
         after = min((low for low, _ in blocked if low >= cuts[n]), default=side / 2)
-        cuts[n] = min(cuts[n], max((before + after) / 2, cuts[n + 1] - room))
+        cuts[n] = min(cuts[n], max((before + after) / 2, cuts[n + 1] - longest))
     return cuts

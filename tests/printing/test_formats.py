@@ -16,8 +16,8 @@ import kpbench.printing.page
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import Arc, Line, circle, move, rectangle
 from kpbench.printing.dxf import to_dxf
-from kpbench.printing.formats import WRITERS
-from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror
+from kpbench.printing.formats import PAGE_WRITERS
+from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, mirror_page
 from kpbench.printing.pdf import to_pdf
 from kpbench.printing.png import px_per_mm, to_png
 from kpbench.printing.svg import to_svg
@@ -72,11 +72,11 @@ def test_vector_formats_hold_the_exact_area_and_place(suffix, name, tmp_path):
 def test_mirror_swaps_left_and_right_only(suffix, name, tmp_path):
     region, area, centroid = KNOWN[name]
     page = page_of(region)
-    got_area, got = measured(suffix, mirror(page), tmp_path)
+    got_area, got = measured(suffix, mirror_page(page), tmp_path)
     x, y = np.array(AT) + RADIUS * np.array(centroid)
     assert got_area == pytest.approx(area * RADIUS**2, rel=AREA[suffix])
     np.testing.assert_allclose(got, (page.width - x, y), atol=5e-5)
-    back = mirror(mirror(page)).shapes[0].region[0][0]
+    back = mirror_page(mirror_page(page)).shapes[0].region[0][0]
     assert (back.x, back.start_deg % 360, back.sweep_deg) == pytest.approx(
         (AT[0], region[0][0].start_deg, region[0][0].sweep_deg)
     )
@@ -223,10 +223,10 @@ def test_text_stands_where_its_anchor_says():
             assert 16 <= dark[:, 0].min() <= dark[:, 0].max() <= 20.1
 
 
-@pytest.mark.parametrize("suffix", WRITERS)
+@pytest.mark.parametrize("suffix", PAGE_WRITERS)
 def test_same_page_same_bytes(suffix):
     page = page_of(PIE, Text("twice", 10, 10, 3))
-    assert WRITERS[suffix]([page, page], 100) == WRITERS[suffix]([page, page], 100)
+    assert PAGE_WRITERS[suffix]([page, page], 100) == PAGE_WRITERS[suffix]([page, page], 100)
 
 
 def test_draw_knows_no_patch():
@@ -257,17 +257,17 @@ def test_pdf_holds_no_image(tmp_path):
 @pytest.mark.skipif(not shutil.which("pdftoppm"), reason="needs poppler")
 def test_mirrored_pages_are_mirror_images_text_and_all(tmp_path):
     page = Page(100, 50, (), (Text("RE", 10, 40, 24), Text("FL", 95, 40, 24, "end")), "")
-    for name, drawn in (("a", page), ("b", mirror(page))):
+    for name, drawn in (("a", page), ("b", mirror_page(page))):
         (tmp_path / f"{name}.pdf").write_bytes(to_pdf([drawn]))
         subprocess.run(["pdftoppm", "-r", "127", "-gray", "-singlefile", f"{name}.pdf", name], cwd=tmp_path, check=True)
     for straight, mirrored in (
         [np.asarray(Image.open(tmp_path / f"{name}.pgm")) for name in ("a", "b")],
-        [np.asarray(Image.open(io.BytesIO(to_png(drawn, 127)))) for drawn in (page, mirror(page))],
+        [np.asarray(Image.open(io.BytesIO(to_png(drawn, 127)))) for drawn in (page, mirror_page(page))],
     ):
         ink, seen = (255.0 - grey[:250, :500] for grey in (straight, mirrored))  # poppler adds a row and a column
         assert np.abs(ink - seen[:, ::-1]).sum() < 0.15 * ink.sum()
         assert np.abs(ink - seen).sum() > ink.sum()
-    assert to_svg(mirror(page)).count(b"matrix(-1 0 0 1 ") == 2
+    assert to_svg(mirror_page(page)).count(b"matrix(-1 0 0 1 ") == 2
 
 
 def test_the_pdf_embeds_its_font():

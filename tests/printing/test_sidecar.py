@@ -6,15 +6,17 @@ import pytest
 from kpbench.errors import DesignError
 from kpbench.patches.board import hexagon_board
 from kpbench.patches.design import shipped_patches
-from kpbench.printing.sheet import PageFormat, board_sheet, patch_sheet, save_sheet
-from kpbench.printing.sidecar import correct_sidecars, corrected
+from kpbench.printing.page_format import PageFormat
+from kpbench.printing.prints import save_sheet
+from kpbench.printing.sheet import board_sheet, patch_sheet
+from kpbench.printing.sidecar import correct_sidecar, correct_sidecars
 
 BOARD = board_sheet(hexagon_board(shipped_patches()[0], 350), PageFormat(210, 297), tile=True)
 SHEET = patch_sheet(shipped_patches(), 20, PageFormat(120, 80))
 
 
 def test_positions_follow_each_ruler():
-    after = corrected(BOARD.sidecar, (99.0, 102.0))
+    after = correct_sidecar(BOARD.sidecar, (99.0, 102.0))
     assert after["print_scale"] == [0.99, 1.02]
     assert after["side_mm"] == [346.5, 357.0]
     for k, nominal in zip(after["keypoints"], BOARD.sidecar["keypoints"], strict=True):
@@ -29,12 +31,12 @@ def test_positions_follow_each_ruler():
 
 
 def test_a_true_print_changes_nothing():
-    assert corrected(BOARD.sidecar, (100, 100)) == BOARD.sidecar
+    assert correct_sidecar(BOARD.sidecar, (100, 100)) == BOARD.sidecar
 
 
 def test_short_rulers_count_as_what_they_are():
     assert SHEET.sidecar["ruler_mm"] == [90, 50]
-    after = corrected(SHEET.sidecar, (90.9, 49.5))
+    after = correct_sidecar(SHEET.sidecar, (90.9, 49.5))
     assert after["print_scale"] == pytest.approx([1.01, 0.99])
     assert after["keypoints"][0]["diameter_mm"] == pytest.approx(20 * np.sqrt(1.01 * 0.99))
 
@@ -44,10 +46,10 @@ def test_a_length_that_cannot_be_is_refused(measured):
     with pytest.raises(
         DesignError, match=r"the x ruler is 100 mm, but .* mm was measured; expected 90 to 110"
     ) as caught:
-        corrected(BOARD.sidecar, measured, "a.json")
+        correct_sidecar(BOARD.sidecar, measured, "a.json")
     assert str(caught.value).startswith("a.json: ")
     with pytest.raises(DesignError, match="the y ruler"):
-        corrected(BOARD.sidecar, measured[::-1])
+        correct_sidecar(BOARD.sidecar, measured[::-1])
 
 
 def test_a_folder_of_prints(tmp_path):
@@ -60,7 +62,9 @@ def test_a_folder_of_prints(tmp_path):
     (tmp_path / "patches.json").unlink()
     for _ in range(2):  # the second time starts from the nominal sidecar again
         assert [p.name for p in correct_sidecars(tmp_path, (99.0, 101.0))] == [f"{BOARD.name}.measured.json"]
-    assert json.loads((tmp_path / f"{BOARD.name}.measured.json").read_text()) == corrected(BOARD.sidecar, (99.0, 101.0))
+    assert json.loads((tmp_path / f"{BOARD.name}.measured.json").read_text()) == correct_sidecar(
+        BOARD.sidecar, (99.0, 101.0)
+    )
 
 
 def test_what_is_no_sidecar(tmp_path):

@@ -18,7 +18,7 @@ def check(board, tiles, room_x, room_y):
     assert all(t.x1 - t.x0 <= room_x + 1e-5 and t.y1 - t.y0 <= room_y + 1e-5 for t in tiles)
     assert sum((t.x1 - t.x0) * (t.y1 - t.y0) for t in tiles) == pytest.approx(board.side_x_mm * board.side_y_mm)
     for k in board.keypoints:
-        (home,) = [t for t in tiles if t.holds(k.x_mm, k.y_mm)]
+        (home,) = [t for t in tiles if t.contains(k.x_mm, k.y_mm)]
         for t in [home]:
             inner_x = [v for v in (t.x0, t.x1) if abs(v) < board.side_x_mm / 2 - 1e-9]
             inner_y = [v for v in (t.y0, t.y1) if abs(v) < board.side_y_mm / 2 - 1e-9]

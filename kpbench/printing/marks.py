@@ -1,0 +1,88 @@
+"""Marks on a page before any mirroring: rulers, lines of text, cut marks, registration crosses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from kpbench.geometry.outline import Line, Region, circle, rectangle
+from kpbench.printing.page import CUT, MARKS, Shape, Text
+from kpbench.printing.page_format import BLANK, MARGIN, STRIP, PageFormat
+
+LINE = 0.1  # mm, width of every mark
+TICK_GAP, TICK = 1.0, 2.0  # mm, distance of a cut mark from the cut, and length of the mark
+CROSS_ARM = 2.5  # mm, from the centre of a registration cross to its end
+FONT_SIZE = 2.2  # mm
+SMALLEST_FOOT = 1.2  # mm: a foot in a smaller font moves into the line on top
+CHARACTER_WIDTH = 0.6  # of the font size: no font in use is wider on average, for digits and lower case
+
+
+def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
+    """Return both rulers, the line of text on top, and the line of text at the bottom right."""
+    (ruler_x, ruler_y), width, height = page_format.rulers_mm, page_format.width_mm, page_format.height_mm
+    inner, below = BLANK + STRIP, height - BLANK - STRIP
+    shapes = [
+        Shape(_polygon((MARGIN + u, below + v) for u, v in _ruler(ruler_x)), MARKS),
+        Shape(_polygon((inner - v, height - MARGIN - u) for u, v in _ruler(ruler_y)), MARKS),
+    ]
+    check = f"print at 100 %, check with a ruler: {ruler_x:g} mm"
+    end, bottom = MARGIN + ruler_x, height - BLANK - 0.6
+    foot_size = font_size(foot, width - MARGIN - end - 12)
+    if foot_size < SMALLEST_FOOT:  # a small page has no room beside the ruler
+        title, foot = f"{title}, {foot}", ""
+    size = font_size(f"{title}    {check}", page_format.ink_size_mm[0])
+    x, y = BLANK + STRIP / 2, height - MARGIN - ruler_y
+    texts = [
+        Text(title, MARGIN, BLANK + size, size),
+        Text(check, width - MARGIN, BLANK + size, size, "end"),
+        Text(f"{ruler_x:g} mm", end + 1.5, bottom, FONT_SIZE),
+        Text(foot, width - MARGIN, bottom, foot_size, "end"),
+        Text(f"{ruler_y:g}", x, y - 3.2, 1.7, "middle"),
+        Text("mm", x, y - 1.2, 1.7, "middle"),
+    ]
+    return shapes, texts
+
+
+def _ruler(length: float) -> list[tuple[float, float]]:
+    """Return the outline of a ruler along +u with its ticks towards +v; the tick of n mm is centred on u = n."""
+    half = LINE / 2
+    points = [(length + half, 0.0), (-half, 0.0)]
+    for n in range(round(length) + 1):
+        tick = STRIP * (1.0 if n % 10 == 0 else 0.6 if n % 5 == 0 else 0.4)
+        points += [(n - half, LINE), (n - half, tick), (n + half, tick), (n + half, LINE)]
+    return points
+
+
+def disc_marks(x: float, y: float, radius: float) -> list[Shape]:
+    """Return the cut around a disc, and four cut marks that stay clear of the ink."""
+    near, far, half = radius + TICK_GAP, radius + TICK_GAP + TICK, LINE / 2
+    boxes = [(near, -half, TICK, LINE), (-far, -half, TICK, LINE), (-half, near, LINE, TICK), (-half, -far, LINE, TICK)]
+    ticks = [Shape(rectangle(x + dx, y + dy, w, h), MARKS) for dx, dy, w, h in boxes]
+    return [*ticks, Shape(circle(x, y, radius), CUT)]
+
+
+def crop_mark(x: float, y: float, right: int, down: int) -> Region:
+    """Return two cut marks that continue the edges of a board beyond its corner at (x, y).
+
+    ``right`` and ``down`` are 1 or -1: the directions in which the marks lead away from the board.
+    """
+    near, half = TICK_GAP / 2, LINE / 2
+    along = rectangle(x + near if right > 0 else x - near - TICK, y - half, TICK, LINE)
+    return along + rectangle(x - half, y + near if down > 0 else y - near - TICK, LINE, TICK)
+
+
+def registration_cross() -> Region:
+    """Return a registration cross about the origin, as one contour."""
+    arm, half = CROSS_ARM, LINE / 2
+    corners = [(half, -half), (arm, -half), (arm, half)]
+    turns = [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    return _polygon((c * x - s * y, s * x + c * y) for c, s in turns for x, y in corners)
+
+
+def _polygon(points: Iterable[tuple[float, float]]) -> Region:
+    corners = list(points)
+    return (tuple(Line(*a, *b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)),)
+
+
+def font_size(text: str, width: float) -> float:
+    """Return the font size in mm, at most :data:`FONT_SIZE`, at which a text is no wider than ``width`` mm."""
+    return max(min(FONT_SIZE, width / (CHARACTER_WIDTH * len(text))), 0.5)
