@@ -26,7 +26,7 @@ from torch import nn
 from tqdm import tqdm
 
 from kpbench import load_patches, shipped_patches
-from kpbench.training import Phase, Recipe, load_recipe, train
+from kpbench.training import Phase, Recipe, TrainOptions, load_recipe, train
 from kpbench.workers import count_cores, use_one_thread
 
 RUNNER_UP = Path(__file__).parents[1] / "designs" / "runner-up"
@@ -51,7 +51,7 @@ def _no_lookalikes(recipe: Recipe) -> Recipe:
 
 
 def _one_scale(recipe: Recipe) -> Recipe:
-    mock.patch.dict("kpbench.training.crops.VIEWS", {1.0: 1.0}, clear=True).start()
+    mock.patch.dict("kpbench.training.crops.VIEW_SCALES", {1.0: 1.0}, clear=True).start()
     return recipe
 
 
@@ -93,10 +93,7 @@ def run(name: str, backgrounds: Path, samples: int) -> dict[str, float]:
             folder,
             backgrounds,
             patches=patches,
-            workers=0,
-            threads=1,
-            validate_every=1e9,
-            validation_images=200,
+            options=TrainOptions(workers=0, threads=1, validate_every=1e9, validation_images=200),
         )
         return json.loads((Path(folder) / "log.jsonl").read_text().splitlines()[-1])
 

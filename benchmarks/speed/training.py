@@ -1,6 +1,6 @@
 """Training throughput, samples a second, and what bounds it.
 
-    python benchmarks/speed/training.py --config RECIPE.toml --backgrounds photos/ [--threads 1] [--batches 20]
+    python benchmarks/speed/training.py --config reference --backgrounds photos/ [--threads 1] [--batches 20]
 
 generator  one process that makes batches, and nothing else: what one of ``--workers`` of ``kpbench train`` delivers
 step       forward, backward and optimizer on a batch that is there already, on a GPU where there is one
@@ -22,16 +22,14 @@ import numpy as np
 import torch
 
 from kpbench.patches import shipped_patches
-from kpbench.training.batches import load_photos, make_batch
-from kpbench.training.loop import start, step_once, train
-from kpbench.training.recipe import Phase, load_recipe
+from kpbench.training import Phase, TrainOptions, load_photos, load_recipe, make_batch, start_state, train, train_step
 
 ROUNDS = 3
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--config", required=True)
     parser.add_argument("--backgrounds", type=Path, required=True)
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--batches", type=int, default=20)
@@ -42,7 +40,7 @@ def main() -> None:
     recipe = replace(recipe, phases=(Phase(samples, severity=(1.0, 1.0)),), warmup=0)
     patches, photos = shipped_patches(), load_photos(options.backgrounds, "training")
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    state = start(recipe, device)
+    state = start_state(recipe, device)
     ready = make_batch(recipe.samples, patches, photos, 0, 0, recipe.batch, 1.0)
     images, keypoints = (torch.from_numpy(part).to(device) for part in ready)
 
@@ -53,13 +51,14 @@ def main() -> None:
     def steps() -> None:
         for _ in range(options.batches):
             state.step = 0
-            step_once(state, state.network, images, keypoints, 1)
+            train_step(state, state.network, images, keypoints)
         if device.type == "cuda":
             torch.cuda.synchronize()
 
     def whole() -> None:
         with tempfile.TemporaryDirectory() as folder:
-            train(recipe, folder, options.backgrounds, workers=1, threads=options.threads, validation_images=1)
+            how = TrainOptions(threads=options.threads, validation_images=1)
+            train(recipe, folder, options.backgrounds, options=how)
 
     rivals: dict[str, Callable[[], None]] = {"generator": generate, "step": steps, "train": whole}
     rates: dict[str, list[float]] = {name: [] for name in rivals}

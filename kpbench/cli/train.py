@@ -143,19 +143,17 @@ def _train_detector(
 
     recipe = load_recipe(config)
     with _needs_torch("train"):
-        from kpbench.training import loop as training
+        from kpbench.training.loop import TrainOptions
+        from kpbench.training.loop import train as train_network
     folder = out or Path("runs") / recipe.name
-    finished = training.train(
+    finished = train_network(
         recipe,
         folder,
         backgrounds,
-        init=init,
-        resume_run=resume,
-        minutes=minutes,
-        workers=1 if workers is None else workers,
-        threads=threads,
-        tensorboard=tensorboard,
         patches=load_patches(patches) if patches else shipped_patches(),
+        options=TrainOptions(
+            init, resume, minutes, 1 if workers is None else workers, threads, tensorboard=tensorboard
+        ),
         say=lambda line: click.echo(line, err=True),
     )
     click.echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")

@@ -2,8 +2,11 @@ from .batches import Batch as Batch
 from .batches import SampleConfig as SampleConfig
 from .batches import load_photos as load_photos
 from .batches import make_batch as make_batch
+from .checkpoint import TrainingState as TrainingState
+from .checkpoint import start_state as start_state
 from .export import Exported as Exported
 from .export import export_onnx as export_onnx
+from .loop import TrainOptions as TrainOptions
 from .loop import train as train
 from .network import SuperPoint as SuperPoint
 from .quantise import export_int8 as export_int8
@@ -12,6 +15,7 @@ from .recipe import NetworkConfig as NetworkConfig
 from .recipe import Phase as Phase
 from .recipe import Recipe as Recipe
 from .recipe import load_recipe as load_recipe
+from .step import train_step as train_step
 from .verifier.ellipse import train_ellipse as train_ellipse
 from .verifier.judges import train_judges as train_judges
 

@@ -1,7 +1,7 @@
-"""Training samples made on the fly: a batch is a function of (config, seed, index) and of nothing else.
+"""Training samples, made on the fly: a batch is a function of configuration, seed and index.
 
-Two kinds: ``scenes`` are whole images as ``kpbench synth`` writes them; ``crops`` are small windows
-(:mod:`kpbench.training`) with degradations whose strength the training loop raises.
+There are two kinds of samples. Scenes are whole images as ``kpbench synth`` writes them. Crops
+(:mod:`kpbench.training.crops`) are small windows with degradations whose severity grows during the training.
 """
 
 from __future__ import annotations
@@ -22,25 +22,41 @@ from kpbench.patches.design import Patch
 from kpbench.render.background import PhotoFolder, procedural_background
 from kpbench.render.placement import Limits, random_placements
 from kpbench.render.scene import render_scene
-from kpbench.training.crops import MOST_KEYPOINTS, make_crops, no_keypoints, window
+from kpbench.training.crops import MOST_KEYPOINTS, cut_window, empty_keypoints, make_crops
 from kpbench.types import Float32, UInt8
 from kpbench.workers import run_in_order
 
 VALIDATION_EVERY = 10
+"""One in so many photographs is kept for validation."""
+PHOTO_PX = 640
+"""Photographs are shrunk to this long side."""
+LEAST_PHOTO_PX = 8
+"""Short side of the smallest photograph that is used."""
 
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """What the training sees.
+    """Samples of a training.
 
     Attributes
     ----------
     kind : str
-        "crops" or "scenes", see the module.
+        "crops" or "scenes".
     size : (int, int)
-        Width and height of a sample, px, multiples of 8.
+        Width and height of a sample, px; multiples of 8.
     set_size : int
-        Scenes only: how many different scenes there are; sample i shows scene i modulo this.
+        Number of different scenes: sample i shows scene i modulo this number. Crops do not repeat.
+
+    Raises
+    ------
+    DataError
+        If a value is out of its range.
+
+    Examples
+    --------
+    >>> from kpbench.training import SampleConfig
+    >>> SampleConfig(size=(64, 64)).kind
+    'crops'
     """
 
     kind: str = "crops"
@@ -55,10 +71,14 @@ class SampleConfig:
 
 
 class Batch(NamedTuple):
-    """Images (B, H, W) uint8, and keypoints (B, K, 4) float32.
+    """B samples.
 
-    A keypoint is x, y (px), place of its patch in the design set (−1: there is none) and ignore radius
-    (px): 0 for one that is to be found; else nothing is asked for within that distance.
+    Attributes
+    ----------
+    images : ndarray of shape (B, H, W), uint8
+    keypoints : ndarray of shape (B, K, 4), float32
+        x and y, px; index of the design, -1 in rows without a keypoint; and ignore radius, px. An ignore radius of 0
+        marks a keypoint that is to be found. Within a larger one nothing is asked for.
     """
 
     images: UInt8
@@ -66,19 +86,26 @@ class Batch(NamedTuple):
 
 
 def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
-    """Photographs of a folder in grey, in the order of their names; broken ones are left out.
+    """Load the photographs of a folder in grey, in the order of their names; broken ones are left out.
 
     Parameters
     ----------
     folder : path or None
         None gives 64 procedural textures.
     part : str
-        "validation" (every tenth) or "training" (the others); one photograph alone is both.
+        "validation" (every tenth photograph) or "training" (the others). A single photograph belongs to both.
 
     Raises
     ------
     DataError
-        As :meth:`kpbench.render.PhotoFolder.open`, or if none of the part can be decoded.
+        If the folder holds no photographs, or none of the part can be decoded.
+
+    Examples
+    --------
+    >>> from kpbench.training import load_photos
+    >>> textures = load_photos(None, "validation")
+    >>> len(textures), textures[0].shape
+    (7, (480, 640))
     """
 
     def kept(n: int, count: int) -> bool:
@@ -89,7 +116,8 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     photos = PhotoFolder.open(folder)
     files = [name for n, name in enumerate(photos.files) if kept(n, len(photos.files))]
     read = (decode_photo(photos.path / name, 1) for name in files)
-    good = [image for image in (_at_most(image) for image in read if image is not None) if min(image.shape) >= 8]
+    shrunk = (_shrink(image) for image in read if image is not None)
+    good = [image for image in shrunk if min(image.shape) >= LEAST_PHOTO_PX]
     if not good:
         raise DataError(
             f"{folder}: none of the {len(files)} photographs for {part} can be decoded (every tenth validates)"
@@ -97,8 +125,9 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     return good
 
 
-def _at_most(image: UInt8, side: int = 640) -> UInt8:
-    scale = side / max(image.shape)
+def _shrink(image: UInt8) -> UInt8:
+    """Return a photograph with a long side of at most ``PHOTO_PX``."""
+    scale = PHOTO_PX / max(image.shape)
     if scale < 1:
         image = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
     return image
@@ -113,27 +142,39 @@ def make_batch(
     count: int,
     severity: float,
 ) -> Batch:
-    """The ``count`` samples of batch ``index``.
+    """Make one batch.
 
     Parameters
     ----------
     config : SampleConfig
     patches : sequence of Patch
     photos : sequence of ndarray of shape (H, W), uint8
+        Backgrounds, see :func:`load_photos`.
     seed, index : int
+        The samples are a function of both.
     count : int
+        Number of samples.
     severity : float
-        0: clean images; 1: the full range of degradations.
+        Severity of the degradations, from 0 (clean) to 1 (the full range).
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.training import SampleConfig, load_photos, make_batch
+    >>> photos = load_photos(None, "training")
+    >>> batch = make_batch(SampleConfig(), kpbench.shipped_patches(), photos, seed=0, index=0, count=8, severity=0.5)
+    >>> batch.images.shape, batch.keypoints.shape
+    ((8, 96, 96), (8, 12, 4))
     """
     rng = np.random.default_rng([seed, index])
     if config.kind == "scenes":
-        return _scenes(config, patches, photos, rng, seed, index * count, count, severity)
+        return _make_scenes(config, patches, photos, rng, seed, index * count, count, severity)
     return Batch(*make_crops(*config.size, patches, photos, rng, count, severity))
 
 
 @dataclass(frozen=True)
-class Job:
-    """One batch to make: its index, its number of samples, and the severity of its degradations."""
+class BatchJob:
+    """One batch that is to be made: its index, its number of samples, and the severity of its degradations."""
 
     index: int
     count: int
@@ -145,7 +186,7 @@ def training_batches(
     patches: Sequence[Patch],
     folder: str | Path | None,
     seed: int,
-    jobs: Iterable[Job],
+    jobs: Iterable[BatchJob],
     workers: int,
 ) -> Iterator[Batch]:
     """Yield training batches in the order of their jobs, made ahead by worker processes.
@@ -159,7 +200,7 @@ def training_batches(
     folder : path or None
         Photographs for backgrounds, see :func:`load_photos`.
     seed : int
-    jobs : iterable of Job
+    jobs : iterable of BatchJob
     workers : int
         Number of worker processes. With 0, this process makes the batches.
 
@@ -172,7 +213,9 @@ def training_batches(
     return run_in_order(partial(_run_job, config, tuple(patches), folder, seed), jobs, workers)
 
 
-def _run_job(config: SampleConfig, patches: Sequence[Patch], folder: str | Path | None, seed: int, job: Job) -> Batch:
+def _run_job(
+    config: SampleConfig, patches: Sequence[Patch], folder: str | Path | None, seed: int, job: BatchJob
+) -> Batch:
     return make_batch(config, patches, _training_photos(folder), seed, job.index, job.count, job.severity)
 
 
@@ -182,7 +225,7 @@ def _training_photos(folder: str | Path | None) -> list[UInt8]:
     return load_photos(folder, "training")
 
 
-def _scenes(
+def _make_scenes(
     config: SampleConfig,
     patches: Sequence[Patch],
     photos: Sequence[UInt8],
@@ -194,10 +237,10 @@ def _scenes(
 ) -> Batch:
     width, height = config.size
     images = np.zeros((count, height, width), np.uint8)
-    keypoints = no_keypoints(count)
+    keypoints = empty_keypoints(count)
     for n in range(count):
         fixed = np.random.default_rng([seed, 1, (first + n) % config.set_size])
-        background = window(photos[int(fixed.integers(len(photos)))], fixed, width, height)
+        background = cut_window(photos[int(fixed.integers(len(photos)))], fixed, width, height)
         rendered = render_scene(background, random_placements(fixed, width, height, patches, Limits()))
         image = apply_effects(rendered.image, rng, draw_paper_mix(rng)) if rng.random() < severity else rendered.image
         images[n] = image

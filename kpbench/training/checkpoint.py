@@ -1,11 +1,11 @@
-"""Checkpoints: everything that a run needs to go on to the bit."""
+"""The state of a training, and checkpoints: files that hold all that a training needs to go on to the bit."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +20,74 @@ from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe, parse_recipe
 
 SCHEMA = "kpbench.checkpoint/1"
+"""Schema of the metadata in a checkpoint."""
 
 
-def designs_digest(patches: Sequence[Patch]) -> str:
-    """SHA-256 over the designs, in their order: which network output means which ink."""
+@dataclass
+class TrainingState:
+    """All that changes during a training.
+
+    Attributes
+    ----------
+    recipe : Recipe
+    network : SuperPoint
+        The weights that are trained.
+    mean : SuperPoint
+        Their running mean, which is validated and exported.
+    optimizer : torch.optim.Optimizer
+    step : int
+        Number of steps that are done.
+    seconds : float
+        Time that they took, s.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from kpbench.training import TrainingState, load_recipe, start_state
+    >>> state = start_state(load_recipe("reference"), torch.device("cpu"))
+    >>> isinstance(state, TrainingState)
+    True
+    """
+
+    recipe: Recipe
+    network: SuperPoint
+    mean: SuperPoint
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+
+
+def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
+    """Return the state of a training before its first step; the weights are a function of the recipe's seed.
+
+    Examples
+    --------
+    >>> import torch
+    >>> from kpbench.training import load_recipe, start_state
+    >>> start_state(load_recipe("reference"), torch.device("cpu")).step
+    0
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(recipe.seed)
+        network = SuperPoint(recipe.network)
+        mean = SuperPoint(recipe.network)
+    network.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
+    mean.to(device, memory_format=torch.channels_last).requires_grad_(False).eval()  # type: ignore[call-overload]
+    mean.load_state_dict(network.state_dict())
+    kind = torch.optim.Adam if recipe.optimizer == "adam" else torch.optim.AdamW
+    optimizer = kind(
+        network.parameters(), lr=recipe.lr, weight_decay=recipe.weight_decay, fused=device.type == "cuda" or None
+    )
+    return TrainingState(recipe, network, mean, optimizer)
+
+
+def digest_designs(patches: Sequence[Patch]) -> str:
+    """Return the SHA-256 of designs in their order, which is the order of the channels of the ID head."""
     return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
 
 
-def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
-    """Write all of the state to one safetensors file, whole or not at all."""
+def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
+    """Write a state to one safetensors file, whole or not at all."""
     from safetensors.torch import save
 
     tensors = {f"network.{k}": v for k, v in state.network.state_dict().items()}
@@ -42,7 +101,7 @@ def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
         "step": state.step,
         "seconds": round(state.seconds, 1),
         "patches": [p.to_dict() for p in patches],
-        "designs": designs_digest(patches),
+        "designs": digest_designs(patches),
         "versions": {"kpbench": __version__, "torch": torch.__version__},
     }
     packed = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
@@ -50,12 +109,12 @@ def save_checkpoint(state: State, path: Path, patches: Sequence[Patch]) -> None:
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """(content, tensors) of a checkpoint.
+    """Return the metadata and the tensors of a checkpoint.
 
     Raises
     ------
     DataError
-        If the file is no checkpoint of this version.
+        If the file is no checkpoint of this schema.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -70,20 +129,41 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     return content, tensors
 
 
-def network_of(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
-    """The running mean of a checkpoint as a network in evaluation mode."""
+def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
+    """Put a checkpoint into a state from :func:`start_state`.
+
+    Raises
+    ------
+    DataError
+        If the file is no checkpoint, or it belongs to another recipe or to other designs.
+    """
+    content, tensors = read_checkpoint(path)
+    theirs = parse_recipe(content["recipe"], str(path))
+    changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(state.recipe, f.name)]
+    if changed:
+        raise DataError(f"{path}: was trained with another {' and '.join(changed)}; use another folder as `out`")
+    if content["designs"] != digest_designs(patches):
+        raise DataError(f"{path}: was trained on other patch designs; use another folder as `out`")
+
+    def part(prefix: str) -> dict[str, Tensor]:
+        return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+
+    state.network.load_state_dict(part("network."))
+    state.mean.load_state_dict(part("mean."))
+    moments = part("optimizer.")
+    for name, parameter in state.network.named_parameters():
+        own = {key: moments[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in moments}
+        if own:
+            like = torch.empty_like(parameter)  # keeps the memory format, on which rounding may depend
+            on_device = {key: value if key == "step" else like.clone().copy_(value) for key, value in own.items()}
+            if parameter.device.type == "cuda":
+                on_device["step"] = on_device["step"].to(parameter.device)
+            state.optimizer.state[parameter] = on_device
+    state.step, state.seconds = content["step"], content["seconds"]
+
+
+def load_mean_network(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
+    """Return the running mean of a checkpoint as a network in evaluation mode."""
     network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
     network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
     return network.eval()
-
-
-@dataclass
-class State:
-    """What changes while training."""
-
-    recipe: Recipe
-    network: SuperPoint
-    mean: SuperPoint  # exponential moving average of ``network``
-    optimizer: torch.optim.Optimizer
-    step: int = 0
-    seconds: float = 0.0

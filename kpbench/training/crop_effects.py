@@ -1,4 +1,4 @@
-"""Deterioration of training crops."""
+"""Degradations of training crops, drawn at random."""
 
 from __future__ import annotations
 
@@ -13,24 +13,44 @@ from kpbench.types import Float32, UInt8
 def degrade_crop(
     image: UInt8, rng: np.random.Generator, severity: float, radius: float
 ) -> tuple[UInt8, float, float, float]:
-    """Light, blur, noise, compression; returns (image, gain, kernel width in px, noise in grey levels)."""
-    gain, kernel, sigma = 1.0, 0.0, 0.6  # rounding, and what a sensor adds at best
+    """Degrade a crop by light, rain, blur, noise and compression.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W), uint8
+    rng : Generator
+    severity : float
+        From 0 to 1.
+    radius : float
+        Short semi-axis of the smallest patch, px: it limits the blur.
+
+    Returns
+    -------
+    image : ndarray of shape (H, W), uint8
+    gain : float
+        Least factor by which contrast has fallen.
+    kernel : float
+        Width of the blur, px.
+    sigma : float
+        Standard deviation of the noise, grey levels.
+    """
+    gain, kernel, sigma = 1.0, 0.0, 0.6  # noise of rounding and of a good sensor
     work = image.astype(np.float32)
     if rng.random() < 0.3 * severity:
-        work, factor = _shade(work, rng)
+        work, factor = _draw_shadow(work, rng)
         gain *= factor
     if rng.random() < 0.08 * severity:
-        work = 0.7 * _rain(work, rng)
+        work = 0.7 * _draw_rain(work, rng)
         gain *= 0.7
         sigma += 4.0
     if rng.random() < 0.6 * severity + 0.2:
-        work, kernel = _soften(work, rng, severity, radius)
+        work, kernel = _blur(work, rng, severity, radius)
     draw = rng.random()
-    if draw < 0.35 * severity:  # the dimming ladder reaches 0.6^4
+    if draw < 0.35 * severity:  # the darkest rung of the benchmark is 0.6^4
         factor = 0.6 ** rng.uniform(0.0, 4.3)
         work *= np.float32(factor)
         gain *= factor
-        if rng.random() < 0.3:  # low light: photons, then read noise
+        if rng.random() < 0.3:  # low light: noise of the photons, then of the sensor
             photons = rng.uniform(1.0, 8.0)
             level = np.maximum(work, 0.0) * np.float32(photons)
             work += rng.standard_normal(work.shape, dtype=np.float32) * np.sqrt(level) / np.float32(photons)
@@ -54,12 +74,12 @@ def degrade_crop(
     return result, gain, kernel, sigma
 
 
-def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """A shadow with one straight border, sharp or soft; now and then a glare, or jagged shadows with many borders."""
+def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
+    """Draw a shadow with one straight border, sharp or soft; sometimes a glare, or jagged shadows."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:
-        return _jagged(work, rng)
+        return _draw_jagged_shadows(work, rng)
     if kind < 0.4:
         x = (np.arange(width, dtype=np.float32) - np.float32(rng.uniform(0, width))) / np.float32(rng.uniform(8, width))
         y = (np.arange(height, dtype=np.float32) - np.float32(rng.uniform(0, height))) / np.float32(
@@ -75,20 +95,20 @@ def _shade(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
     return np.asarray(work * (1 - np.float32(1 - factor) * ramp), np.float32), factor
 
 
-def _jagged(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """One or two shadows of five corners anywhere in and around the crop, their sides crossing each other."""
+def _draw_jagged_shadows(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
+    """Draw one or two shadows of five corners anywhere in and around the crop; their sides may cross."""
     height, width = work.shape
-    light, least = np.ones_like(work), 1.0
+    light, darkest = np.ones_like(work), 1.0
     for _ in range(rng.integers(1, 3)):
         corners = np.rint(rng.uniform(-1.0, 2.0, (5, 2)) * (width, height)).astype(np.int32)
         factor = float(rng.uniform(0.3, 0.8))
         light *= np.where(cv2.fillPoly(np.zeros(work.shape, np.uint8), [corners], 1) > 0, np.float32(factor), 1)
-        least *= factor
-    return work * light, least
+        darkest *= factor
+    return work * light, darkest
 
 
-def _rain(work: Float32, rng: np.random.Generator) -> Float32:
-    """Short bright streaks of one slant, a little out of focus."""
+def _draw_rain(work: Float32, rng: np.random.Generator) -> Float32:
+    """Draw short bright streaks of one slant, a little out of focus."""
     height, width = work.shape
     count = rng.integers(10, 60)
     start = rng.uniform(-10, 1, (count, 2)) + rng.uniform(0, 1, (count, 2)) * (width + 10, height + 10)
@@ -99,12 +119,12 @@ def _rain(work: Float32, rng: np.random.Generator) -> Float32:
     return np.asarray(cv2.blur(streaked, (reach, reach), borderType=BORDER_MODE), np.float32)
 
 
-def _soften(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
-    """One of four blurs, no wider than what leaves something of a patch of this radius."""
+def _blur(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
+    """Blur by one of four kernels, narrow enough that a patch of this radius stays visible; return its width too."""
     widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
     width = float(rng.uniform(1.0, max(widest, 1.5)))
     kind = rng.integers(4)
-    if kind == 1:  # a Gaussian of the box's standard deviation
+    if kind == 1:  # a Gaussian with the standard deviation of the box
         return np.asarray(cv2.GaussianBlur(work, (0, 0), width / np.sqrt(12)), np.float32), width
     if kind == 2:
         kernel = line_kernel(round(1.5 * width), float(rng.integers(0, 180)))

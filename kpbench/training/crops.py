@@ -1,9 +1,7 @@
-"""Training crops: small windows with patches, boards of patches and look-alikes in them, made a batch at a time.
+"""Training crops: small windows with patches, boards of patches and look-alikes, made a batch at a time.
 
-Several hundred a second on one core, with degradations whose strength the training loop raises.
-
-Keypoints that no detector could find, because blur or noise has buried them, are marked to be ignored:
-they are neither to be found nor to be left out.
+One core makes several hundred crops per second. A keypoint that no detector could find, because blur or noise has
+buried it, is marked to be ignored: a detection there is neither right nor wrong.
 """
 
 from __future__ import annotations
@@ -24,30 +22,33 @@ from kpbench.training.crop_effects import degrade_crop
 from kpbench.types import Float, Float32, UInt8
 
 MOST_KEYPOINTS = 12
-IMAGE_PX = (640, 480)  # the image that a crop is thought to be cut from: focal lengths are relative to it
-ZOOM = (0.35, 3.0)  # px of a photograph a px of a crop: a photograph fills images 200 to 1,800 px wide
-VIEWS = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
-"""Scales at which a crop's image is shown, and how often each comes."""
-VIEW_RADIUS_PX = (4.0, 40.0)
-"""Radii at the scale 1.5, where what is large is left to the other scales; px of the image itself."""
-DETECTABLE = 12.0
-"""Least contrast / noise · √area of a keypoint that is asked for: 6 sigma at the output of a matched filter."""
-FAINTEST = 4.0
-"""Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of anything fainter."""
+"""Rows of keypoints per crop; further keypoints are left out."""
+IMAGE_PX = (640, 480)
+"""Size of the image that a crop stands for, px: it gives the focal lengths."""
+ZOOM = (0.35, 3.0)
+"""Range of the scale of a background, px of the photograph per px of the crop."""
+VIEW_SCALES = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
+"""Scales at which crops show the image, and the share of crops of each."""
+ENLARGED_RADIUS_PX = (4.0, 40.0)
+"""Range of the radii in enlarged crops, px of the image: larger patches are found at the other scales."""
+LEAST_SIGNAL = 12.0
+"""Least contrast · √area / noise of a keypoint that is asked for: 6 sigmas at the output of a matched filter."""
+LEAST_CONTRAST = 4.0
+"""Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of a lower one."""
 
 
-def no_keypoints(count: int) -> Float32:
-    """Keypoints (count, K, 4) of samples without any."""
+def empty_keypoints(count: int) -> Float32:
+    """Return keypoints (count, MOST_KEYPOINTS, 4) of samples without any."""
     keypoints = np.zeros((count, MOST_KEYPOINTS, 4), np.float32)
     keypoints[..., 2] = -1
     return keypoints
 
 
 class Disc(NamedTuple):
-    """One patch that is to be drawn into a crop; ``place`` is its place in the design set."""
+    """A patch that is drawn into a crop: pose and inks, index of the design, centre and semi-axes in px."""
 
     placement: Placement
-    place: int
+    design: int
     x: float
     y: float
     major: float
@@ -63,17 +64,17 @@ def make_crops(
     count: int,
     severity: float,
 ) -> tuple[UInt8, Float32]:
-    """Crops (count, height, width) and their keypoints (count, K, 4), see :class:`kpbench.training.Batch`."""
+    """Return crops (count, height, width) and their keypoints, see :class:`kpbench.training.Batch`."""
     images = np.zeros((count, height, width), np.uint8)
-    keypoints = no_keypoints(count)
+    keypoints = empty_keypoints(count)
     discs: list[list[Disc]] = []
     canvases: list[UInt8] = []
-    scales = rng.choice(list(VIEWS), count, p=list(VIEWS.values()))
+    scales = rng.choice(list(VIEW_SCALES), count, p=list(VIEW_SCALES.values()))
     for scale in scales:
-        image = _background(photos, rng, round(width / scale), round(height / scale))
+        image = _draw_background(photos, rng, round(width / scale), round(height / scale))
         if rng.random() < 0.5:
             draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
-        drawn = _lay_out(rng, patches, image, Limits.of_radius(*VIEW_RADIUS_PX) if scale > 1 else Limits())
+        drawn = _place_patches(rng, patches, image, Limits.of_radius(*ENLARGED_RADIUS_PX) if scale > 1 else Limits())
         discs.append(drawn)
         canvases.append(image)
     _paint_all(canvases, discs)
@@ -84,24 +85,24 @@ def make_crops(
         images[n] = resize(image, width, height)
         scale = np.divide(images[n].shape, image.shape)[::-1]
         at = [((d.x + 0.5) * scale[0] - 0.5, (d.y + 0.5) * scale[1] - 0.5) for d in discs[n]]
-        inside = [(x, y, d) for (x, y), d in zip(at, discs[n], strict=True) if _holds(images[n], x, y)]
+        inside = [(x, y, d) for (x, y), d in zip(at, discs[n], strict=True) if _contains(images[n], x, y)]
         for k, (x, y, disc) in enumerate(inside[:MOST_KEYPOINTS]):
-            kept = 1.0 - (kernel / (2 * disc.minor)) ** 2
-            contrast = gain * (disc.placement.white - disc.placement.black) * max(kept, 0.0)
+            left = 1.0 - (kernel / (2 * disc.minor)) ** 2
+            contrast = gain * (disc.placement.white - disc.placement.black) * max(left, 0.0)
             area = np.pi * disc.major * disc.minor
-            buried = contrast < max(FAINTEST, DETECTABLE * sigma / np.sqrt(area))
+            buried = contrast < max(LEAST_CONTRAST, LEAST_SIGNAL * sigma / np.sqrt(area))
             small = disc.minor * scale.min() < 0.5 * Limits().minor_axis_px
             lost = buried or small or any(disc is h for h in hidden)
-            keypoints[n, k] = x, y, disc.place, disc.major * scale.max() if lost else 0.0
+            keypoints[n, k] = x, y, disc.design, disc.major * scale.max() if lost else 0.0
     return images, keypoints
 
 
-def window(
+def cut_window(
     photo: UInt8, rng: np.random.Generator, width: int, height: int, zoom: tuple[float, float] | None = None
 ) -> UInt8:
-    """A part of a photograph in a given size, mirrored half of the time.
+    """Cut a part of a photograph in a given size, and mirror it half of the time.
 
-    ``zoom`` is the range of px of the photograph a px of the crop; None: from half the photograph to all of it.
+    ``zoom`` : range of px of the photograph per px of the result. None: from half of the photograph to all of it.
     """
     rows, columns = photo.shape
     largest = min(columns / width, rows / height)
@@ -114,11 +115,11 @@ def window(
     return np.ascontiguousarray(image[:, ::-1] if rng.random() < 0.5 else image, np.uint8)
 
 
-def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
-    """Mostly photographs, of any contrast and brightness; now and then an even surface."""
+def _draw_background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
+    """Draw a background: mostly a photograph, of any contrast and brightness, sometimes an even surface."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
-    image = window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
+    image = cut_window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
     if rng.random() < 0.5:
         middle = rng.uniform(60, 200)
         table = np.clip(middle + rng.uniform(0.4, 1.6) * (np.arange(256) - 127.0), 0, 255).astype(np.uint8)
@@ -126,25 +127,25 @@ def _background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, h
     return image
 
 
-def _holds(image: UInt8, x: float, y: float) -> bool:
+def _contains(image: UInt8, x: float, y: float) -> bool:
     return bool(-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5)
 
 
-def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, limits: Limits) -> list[Disc]:
-    """Choose the patches of one crop; draw the paper below them into the image, if there is any."""
+def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, limits: Limits) -> list[Disc]:
+    """Choose the patches of one crop; if they lie on a sheet of paper, draw the sheet into the image."""
     height, width = image.shape
     on_board = rng.random() < 0.5
-    asked = int(rng.choice(5, p=(0.15, 0.3, 0.22, 0.18, 0.15)))
-    if asked == 0:
+    count = int(rng.choice(5, p=(0.15, 0.3, 0.22, 0.18, 0.15)))
+    if count == 0:
         if on_board:
-            _paper(image, rng, _poses(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
+            _draw_paper(image, rng, _poses_at(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    # centres may lie a little outside: what remains of such a patch is no keypoint
-    at = rng.uniform(-0.1, 1.1, (1 if on_board else asked, 2)) * (width, height) - 0.5
-    poses = _poses(rng, at, limits)
+    # centres may lie a little outside; the rest of such a patch is visible, but is no keypoint
+    at = rng.uniform(-0.1, 1.1, (1 if on_board else count, 2)) * (width, height) - 0.5
+    poses = _poses_at(rng, at, limits)
     if on_board:
         first = poses[0]
-        _paper(image, rng, first)
+        _draw_paper(image, rng, first)
         # a hexagon of circumradius 0.36 S for patches of diameter 0.16 S; other boards are tighter or looser
         ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
         corners = turn + np.arange(6) * np.pi / 3
@@ -166,35 +167,35 @@ def _lay_out(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, l
         poses = poses[poses[:, 2, 2] > 0.2]
         poses /= poses[:, 2:, 2:]
     centres, majors, minors, _ = project_discs(poses)
-    alike = rng.random() < 0.5
-    which = rng.integers(len(patches), size=len(poses))
+    one_design = rng.random() < 0.5
+    design = rng.integers(len(patches), size=len(poses))
     black = rng.uniform(*limits.black, len(poses))
     white = rng.uniform(*limits.white, len(poses))
     if on_board:
         black[:], white[:] = black[0], white[0]
-        if alike:
-            which[:] = which[0]
+        if one_design:
+            design[:] = design[0]
     discs: list[Disc] = []
     for n, H in enumerate(poses):
-        patch = patches[which[n]]
+        patch = patches[design[n]]
         (x, y), reach = centres[n], patch.extent * majors[n]
         seen = -reach < x < width + reach and -reach < y < height + reach and majors[n] < 4 * width
         apart = all(np.hypot(x - d.x, y - d.y) > reach + d.placement.patch.extent * d.major for d in discs)
         if seen and apart:
             placement = Placement(patch, H, float(black[n]), float(white[n]))
-            discs.append(Disc(placement, int(which[n]), H[0, 2], H[1, 2], majors[n], minors[n]))
+            discs.append(Disc(placement, int(design[n]), H[0, 2], H[1, 2], majors[n], minors[n]))
     return discs
 
 
-def _poses(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
-    """Poses as in a whole image, with their keypoints moved to given places (N, 2): the crop is cut around them."""
+def _poses_at(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
+    """Draw poses as in a whole image, and move their keypoints to places (N, 2) px of the crop."""
     poses = random_poses(rng, len(at_px), *IMAGE_PX, limits)
     poses[:, :2] += (at_px - poses[:, :2, 2])[:, :, None] * poses[:, 2:]
     return poses
 
 
-def _paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
-    """A sheet in the plane of the patches: mostly lighter than the white ink, some of it grey or dark."""
+def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
+    """Draw a sheet of paper in the plane of the patches: mostly lighter than the white ink, sometimes grey or dark."""
     grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
     low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
     corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T
@@ -204,15 +205,15 @@ def _paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
 
 
 def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
-    """Put things over the patches; returns those of which more than a third is hidden."""
+    """Draw look-alikes over the patches, and return the patches of which more than a third is hidden."""
     before = image.copy()
     draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)
     hidden = []
     for disc in discs:
-        place = np.zeros_like(before)
-        cv2.circle(place, (round(disc.x), round(disc.y)), max(2, round((disc.major + disc.minor) / 2)), 1, -1)
-        if (changed * place).sum() > place.sum(dtype=np.float32) / 3:
+        covered = np.zeros_like(before)
+        cv2.circle(covered, (round(disc.x), round(disc.y)), max(2, round((disc.major + disc.minor) / 2)), 1, -1)
+        if (changed * covered).sum() > covered.sum(dtype=np.float32) / 3:
             hidden.append(disc)
     return hidden
 
@@ -220,7 +221,7 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patc
 def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
     """Draw the patches of a whole batch with one call of the rasteriser."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
-    # edges true to 1/64 px: cheaper than in a benchmark image, and still below what noise leaves
+    # edges exact to 1/64 px: faster than in a benchmark image, and far finer than the noise
     masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
         paint_patch(image, mask, placement.black, placement.white)

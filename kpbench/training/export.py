@@ -1,4 +1,4 @@
-"""Checkpoint → one ONNX file: BatchNorm folded, any batch, any size in multiples of 8; float32, or 8-bit integers."""
+"""Export of a trained network as one ONNX file, for batches and images of any size (in multiples of 8 px)."""
 
 from __future__ import annotations
 
@@ -18,24 +18,42 @@ from kpbench.detectors.inference import open_session
 from kpbench.detectors.superpoint import CELL_PX, SCHEMA
 from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.training.checkpoint import network_of, read_checkpoint
+from kpbench.training.checkpoint import load_mean_network, read_checkpoint
 from kpbench.training.network import SuperPoint
 
 OPSET = 17
+"""Version of the ONNX operators."""
 MOST_DIFFERENCE = 1e-4
+"""Largest difference of logits between PyTorch and ONNX Runtime."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written: size in bytes, steps of training, and the largest difference from PyTorch's logits."""
+    """What :func:`export_onnx` or :func:`kpbench.training.export_int8` wrote.
+
+    Attributes
+    ----------
+    bytes : int
+        Size of the file.
+    step : int
+        Steps that the network was trained.
+    difference : float
+        Largest difference of the logits from those of the network before.
+
+    Examples
+    --------
+    >>> from kpbench.training import Exported
+    >>> Exported(bytes=1000, step=2, difference=1e-6).step
+    2
+    """
 
     bytes: int
     step: int
     difference: float
 
 
-def fold(network: SuperPoint) -> SuperPoint:
-    """Multiply each BatchNorm into the convolution before it, in place; those after a ReLU stay."""
+def fold_batchnorm(network: SuperPoint) -> SuperPoint:
+    """Fold each BatchNorm into the convolution before it, in place; a BatchNorm after a ReLU stays."""
     network.eval()
     for module in network.modules():
         parts = dict(module.named_children())
@@ -47,12 +65,12 @@ def fold(network: SuperPoint) -> SuperPoint:
 
 
 def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
-    """The network as ONNX: input ``image`` (B, 1, H, W) in [0, 1], outputs ``detector`` and ``identity``."""
+    """Return the network as ONNX: input ``image`` (B, 1, H, W) in [0, 1], outputs ``detector`` and ``identity``."""
     import onnx
 
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # the newer exporter needs packages that nothing else here needs
+        # the newer exporter needs more packages
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             network,
@@ -75,15 +93,34 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
 
 
 def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
-    """Write a checkpoint's mean weights as an ONNX file and compare it with PyTorch.
+    """Write the running mean of a checkpoint as an ONNX file; the file is compared with PyTorch first.
+
+    Parameters
+    ----------
+    checkpoint, out : path
+        Of :func:`kpbench.training.train`, and the file to write.
+
+    Returns
+    -------
+    Exported
 
     Raises
     ------
     DataError
-        If the checkpoint cannot be read, or the file's output differs from PyTorch's by more than 1e-4.
+        If the checkpoint cannot be read, or the outputs differ by more than 1e-4.
+
+    Examples
+    --------
+    >>> from kpbench.training import NetworkConfig, Phase, Recipe, TrainOptions, export_onnx, train
+    >>> network = NetworkConfig((4, 4, 8, 8), (1, 1, 1, 1), head_width=8, descriptor_width=8)
+    >>> recipe = Recipe("tiny", (Phase(4),), network=network, batch=4)
+    >>> train(recipe, "run", options=TrainOptions(workers=0, validation_images=1))
+    True
+    >>> export_onnx("run/checkpoint.safetensors", "tiny.onnx").step
+    1
     """
     content, tensors = read_checkpoint(checkpoint)
-    network = network_of(content, tensors)
+    network = load_mean_network(content, tensors)
     recipe = content["recipe"]
     metadata = {
         "schema": SCHEMA,
@@ -98,7 +135,7 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     image = torch.from_numpy(np.random.default_rng(0).random((2, 1, 72, 104), np.float32))
     with torch.inference_mode():
         expected = [part.numpy() for part in network(image)]
-    data = to_onnx(fold(network), metadata)
+    data = to_onnx(fold_batchnorm(network), metadata)
     difference = largest_difference(data, image.numpy(), expected)
     if difference > MOST_DIFFERENCE:
         raise DataError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, expected at most 1e-4")

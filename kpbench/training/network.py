@@ -118,3 +118,8 @@ class SuperPoint(nn.Module):
         """
         features = self.backbone(image)
         return self.detector_attached(self.detector(features)), self.descriptor_attached(self.descriptor(features))
+
+
+def network_input(images: Tensor) -> Tensor:
+    """Return images (B, H, W) uint8 as the network takes them: (B, 1, H, W) in [0, 1]."""
+    return (images.float() / 255)[:, None].contiguous(memory_format=torch.channels_last)

@@ -1,4 +1,4 @@
-"""How a network does on scenes that it is not trained on."""
+"""Validation: what a network finds in scenes that it is not trained on."""
 
 from __future__ import annotations
 
@@ -15,14 +15,27 @@ from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe
 from kpbench.types import UInt8
 
-Validation = list[tuple[str, Batch]]
+FOUND_PX, CLOSE_PX = 3.0, 1.0
+"""Largest distances of a keypoint that is found, and of one that is found exactly, px."""
+
+ValidationSets = list[tuple[str, Batch]]
+"""Names and samples."""
 
 
-def validation_set(recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], count: int = 32) -> Validation:
-    """Whole images, clean and with the paper's deteriorations, and crops at full severity; fixed by the seed."""
+def make_validation_sets(
+    recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], count: int = 32
+) -> ValidationSets:
+    """Make the validation sets of a training; they are a function of the recipe's seed.
+
+    Returns
+    -------
+    list of (str, Batch)
+        "clean": ``count`` whole images without deteriorations; "paper": the same with the paper's deteriorations;
+        "hard": crops at full severity.
+    """
     scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
     crops = replace(recipe.samples, kind="crops", size=(128, 128))
-    seed = recipe.seed + 2**31  # away from all training batches
+    seed = recipe.seed + 2**31  # no training batch has such a seed
     return [
         ("clean", make_batch(scenes, patches, photos, seed, 0, count, 0.0)),
         ("paper", make_batch(scenes, patches, photos, seed, 0, count, 1.0)),
@@ -31,28 +44,39 @@ def validation_set(recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UI
 
 
 @torch.inference_mode()
-def evaluate(network: SuperPoint, validation: Validation) -> dict[str, float]:
-    """Share of keypoints found within 3 px and within 1 px, right IDs among the former, false alarms an image."""
+def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, float]:
+    """Measure what a network finds, at the default threshold and without verification.
+
+    :func:`kpbench.score` measures something else: its ε is relative to the radius, which crops do not keep, and it
+    knows no keypoints to be ignored, near which a detection is no false alarm.
+
+    Returns
+    -------
+    dict
+        For each set: ``NAME_found_3px`` and ``NAME_found_1px``, the shares of keypoints with a detection that near;
+        ``NAME_id``, the share of right identities among those found within 3 px; ``NAME_alarms``, the number of
+        detections per image that no keypoint explains.
+    """
     network.eval()
     device = next(network.parameters()).device
     figures: dict[str, float] = {}
-    for name, batch in validation:
+    for name, batch in sets:
         truths = found = close = right = alarms = 0
         for image, keypoints in zip(batch.images, batch.keypoints, strict=True):
             blob = torch.as_tensor(image, device=device).float()[None, None] / 255
-            detector, ids = network(blob)
-            detections = decode(detector[0].float().cpu().numpy(), ids[0].float().cpu().numpy())
+            detector, identity = network(blob)
+            detections = decode(detector[0].float().cpu().numpy(), identity[0].float().cpu().numpy())
             explained = np.zeros(len(detections), bool)
-            for x, y, patch, ignore in keypoints[keypoints[:, 2] >= 0]:
+            for x, y, design, ignore in keypoints[keypoints[:, 2] >= 0]:
                 distance = np.hypot(*(detections.xy - (x, y)).T)
-                explained |= distance <= max(3.0, ignore)
+                explained |= distance <= max(FOUND_PX, ignore)
                 if ignore:
                     continue
                 truths += 1
-                if len(distance) and distance.min() <= 3.0:
+                if len(distance) and distance.min() <= FOUND_PX:
                     found += 1
-                    close += bool(distance.min() <= 1.0)
-                    right += bool(detections.patch_id is not None and detections.patch_id[distance.argmin()] == patch)
+                    close += bool(distance.min() <= CLOSE_PX)
+                    right += bool(detections.patch_id is not None and detections.patch_id[distance.argmin()] == design)
             alarms += int(np.sum(~explained))
         figures |= {
             f"{name}_found_3px": found / max(truths, 1),

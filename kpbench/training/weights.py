@@ -1,10 +1,11 @@
-"""Weights to start from: published ones, exported ones, those of a smaller network."""
+"""Initial weights: published ones, exported ones, those of a checkpoint, and those of a smaller network."""
 
 from __future__ import annotations
 
 import json
 import pickle
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any, cast
@@ -12,16 +13,102 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from kpbench.detectors.verification import WEIGHTS
 from kpbench.errors import DataError
-from kpbench.files import PACKAGE
 from kpbench.patches.design import Patch
-from kpbench.training.checkpoint import designs_digest, read_checkpoint
-from kpbench.training.network import SuperPoint
+from kpbench.training.batches import load_photos, make_batch
+from kpbench.training.checkpoint import TrainingState, digest_designs, read_checkpoint, start_state
+from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
+
+BATCHNORM_PX = 128 * 96 * 96
+"""About so many px of samples give the statistics on which BatchNorm starts, but at most 128 and at least 2 samples."""
+
+
+def load_initial_weights(
+    state: TrainingState,
+    init: str | Path,
+    patches: Sequence[Patch],
+    backgrounds: str | Path | None,
+    device: torch.device,
+) -> str:
+    """Give a fresh training its initial weights; a network of other sizes grows from them.
+
+    Parameters
+    ----------
+    state : TrainingState
+        Changed in place.
+    init : str or Path
+        See :func:`read_initial_weights`.
+    patches : sequence of Patch
+    backgrounds : path or None
+        Photographs of the training, see :func:`kpbench.training.load_photos`.
+    device : torch.device
+
+    Returns
+    -------
+    str
+        One line that tells which weights were found.
+
+    Raises
+    ------
+    DataError
+        If the weights cannot be read or do not fit.
+    """
+    recipe, network = state.recipe, state.network
+    weights, sizes = read_initial_weights(init, patches)
+    their_config = replace(sizes or recipe.network, ids=recipe.network.ids)
+    same_sizes = their_config == recipe.network
+    theirs = network if same_sizes else start_state(replace(recipe, network=their_config), device).network
+    line = load_into_network(theirs, weights, str(init))
+    if is_folded(weights) or not same_sizes:
+        photos = load_photos(backgrounds, "training")
+        width, height = recipe.samples.size
+        count = max(2, min(128, BATCHNORM_PX // (width * height)))
+        batch = make_batch(recipe.samples, patches, photos, recipe.seed, 0, count, recipe.phase(0)[1])
+        images = network_input(torch.from_numpy(batch.images).to(device))
+        if is_folded(weights):
+            restore_batchnorm(theirs, [images])
+        if not same_sizes:
+            line += f"; {grow_network(network, theirs, images, str(init))}"
+    state.mean.load_state_dict(network.state_dict())
+    return line
+
+
+def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[dict[str, Tensor], NetworkConfig | None]:
+    """Read weights to start from.
+
+    Parameters
+    ----------
+    name : str or Path
+        ``superpoint`` or ``superpoint-small`` (the shipped weights), an ONNX file of ``kpbench export-model``, a
+        checkpoint (of which the running mean is taken), or published SuperPoint weights.
+    patches : sequence of Patch
+        Designs of the training. An ID head for other designs is left out.
+
+    Returns
+    -------
+    weights : dict of str to Tensor
+    sizes : NetworkConfig or None
+        Sizes of their network, where the file tells them.
+    """
+    shipped = WEIGHTS / f"{name}.onnx"
+    path = shipped if shipped.is_file() and not Path(name).is_file() else Path(name)
+    if path.suffix == ".onnx":
+        content, weights = _read_exported(path)
+    else:
+        weights = read_weights(path)
+        mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
+        if not mean:
+            return weights, None
+        content, weights = read_checkpoint(path)[0], mean
+    same_designs = content.get("designs") == digest_designs(patches)
+    kept = {key: value for key, value in weights.items() if same_designs or not key.startswith("descriptor_attached")}
+    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """Read a state-dict: ``.safetensors``, or a pickled one without unpickling anything but tensors.
+    """Read a state-dict from a safetensors file or a pickle; of a pickle, nothing but tensors is unpickled.
 
     Raises
     ------
@@ -45,37 +132,54 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     return loaded
 
 
-def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> str:
-    """Load published SuperPoint weights into all but the attached layers.
+def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return the metadata and the weights of an ONNX file of ``kpbench export-model``."""
+    import onnx
+
+    try:
+        model = onnx.load(path)
+        content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
+    except Exception as error:  # some errors are of classes of protobuf that are not public
+        why = (str(error) or type(error).__name__).splitlines()[0][:200]
+        raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
+    if "int8" in content:
+        raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
+    if content.get("recipe", {}).get("network", {}).get("norm") == "after":
+        raise DataError(f"{path}: its BatchNorm, after the activation, cannot be put back; start from its checkpoint")
+    return content, {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
+
+
+def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source: str) -> str:
+    """Put a state-dict into a network; the attached layers may be missing and then keep their random weights.
 
     Parameters
     ----------
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
+        Weights without any BatchNorm are complete, see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
     Returns
     -------
     str
-        One line that says what matched and what keeps its random start.
+        One line that tells how many tensors matched and which layers keep their random weights.
 
     Raises
     ------
     DataError
-        If a tensor has no place in the network or another shape, or a part of the network but the
-        attached layers gets none. Weights without any BatchNorm are complete, see :func:`restore_batchnorm`.
+        If a tensor has no place in the network or another shape, or a layer other than the attached layers gets none.
     """
     own = network.state_dict()
     bare = is_folded(weights)
-    # the count of batches seen is no weight, and some files lack it
+    # the number of batches that BatchNorm has seen is no weight, and some files lack it
     ours = {name for name in own if not (name.endswith("num_batches_tracked") or (bare and ".bn." in name))}
-    wanted = {name for name in ours if "_attached" not in name}
+    needed = {name for name in ours if "_attached" not in name}
     given = {name for name in weights if not name.endswith("num_batches_tracked")}
     for name in sorted(given - set(own)):
         raise DataError(f"{source}: {name} has no place in this network")
-    for name in sorted(wanted - given):
+    for name in sorted(needed - given):
         raise DataError(f"{source}: {name} is missing")
     for name in sorted(given):
         if own[name].shape != weights[name].shape:
@@ -86,19 +190,19 @@ def initialise(network: SuperPoint, weights: dict[str, Tensor], source: str) -> 
     return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
 
 
-def is_folded(weights: dict[str, Tensor]) -> bool:
-    """Whether a state-dict has no BatchNorm, as that of an exported file."""
+def is_folded(weights: Mapping[str, Tensor]) -> bool:
+    """Return whether a state-dict has no BatchNorm, as that of an exported file."""
     return not any(".bn." in name for name in weights)
 
 
 def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
-    """Let each BatchNorm pass on what it gets, as its statistics stand on these inputs of the network.
+    """Make each BatchNorm the identity, by its statistics on some inputs of the network.
 
-    The contrary of folding: the network computes what its convolutions alone would, and can be trained on.
-    ``layers`` are the BatchNorms to be set; None: all.
+    This is the reverse of folding: the network computes what its convolutions alone would compute, and can be
+    trained. ``layers`` : the BatchNorms that are set; None: all.
     """
 
-    def pass_on(module: nn.Module, given: tuple[Tensor]) -> None:
+    def become_identity(module: nn.Module, given: tuple[Tensor]) -> None:
         bn = cast(nn.BatchNorm2d, module)
         variance, mean = torch.var_mean(given[0], (0, 2, 3), correction=0)
         cast(Tensor, bn.running_mean).copy_(mean)
@@ -107,7 +211,7 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
         bn.bias.copy_(mean)
 
     chosen = [m for m in network.modules() if isinstance(m, nn.BatchNorm2d)] if layers is None else layers
-    hooks = [m.register_forward_pre_hook(pass_on) for m in chosen]
+    hooks = [m.register_forward_pre_hook(become_identity) for m in chosen]
     mode = network.training
     with torch.no_grad():
         network.eval()(*inputs)
@@ -117,38 +221,39 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
 
 
 @torch.no_grad()
-def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
-    """Start a network as a trained one that is narrower, or of another depth (after Chen et al., Net2Net, ICLR 2016).
+def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
+    """Start a network from a trained one that is narrower or of another depth (Chen et al., *Net2Net*, ICLR 2016).
 
-    Channels that the smaller network lacks keep their random weights, and nothing learnt listens to them yet. In
-    each stage the convolutions that it lacks pass on what they get, and what it has beyond is left out. Where
-    nothing is left out and both halve alike, the network computes what the smaller one does; else it begins near.
+    The channels of the smaller network fill the first channels. The other channels keep their random weights, and no
+    trained channel listens to them yet. In each stage, convolutions that the smaller network lacks become the
+    identity, and its convolutions that are too many are left out. The network then computes what the smaller one
+    computes, unless convolutions are left out or the two networks halve the image in different ways.
 
     Parameters
     ----------
     network : SuperPoint
         Changed in place.
     smaller : SuperPoint
-        Its BatchNorm in place, see :func:`restore_batchnorm`.
-    images : Tensor of shape (B, 1, H, W) in [0, 1]
-        On which the BatchNorm of convolutions that pass on stands.
+        With BatchNorm, see :func:`restore_batchnorm`.
+    images : Tensor of shape (B, 1, H, W)
+        In [0, 1]; they give the statistics of the BatchNorms after convolutions that become the identity.
     source : str
         Name of the smaller network, for messages.
 
     Returns
     -------
     str
-        What became of it, in a few words.
+        A few words that tell what was done.
 
     Raises
     ------
     DataError
-        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of them: what
-        passes on would lose its negative part.
+        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of the two: then no
+        convolution can become the identity, as the activation would cut off negative values.
     """
     if "after" in (smaller.config.norm, network.config.norm):
         raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")
-    passing: list[nn.Module] = []
+    identities: list[nn.Module] = []
     width, left_out = 1, 0
     for n, (stage, theirs) in enumerate(zip(network.backbone, smaller.backbone, strict=True)):
         for layer, given in zip_longest(_blocks(stage), _blocks(theirs)):
@@ -156,29 +261,34 @@ def grow(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) 
                 left_out += 1
             elif given is None:
                 nn.init.dirac_(cast(Tensor, layer.get_submodule("conv").weight)[:width])
-                passing.append(layer.get_submodule("bn"))
+                identities.append(layer.get_submodule("bn"))
             else:
-                width = _take(layer, given, width, f"{source}: stage {n + 1}")
+                width = _copy_channels(layer, given, width, f"{source}: stage {n + 1}")
     for head in ("detector", "descriptor"):
-        heard = width
+        inputs = width
         for name in (f"{head}.0", f"{head}.1", f"{head}_attached"):
-            heard = _take(network.get_submodule(name), smaller.get_submodule(name), heard, f"{source}: {name}")
-    restore_batchnorm(network, [images], passing)
-    return f"taken into another network, convolutions that pass on: {len(passing)}, left out: {left_out}"
+            layer, given = network.get_submodule(name), smaller.get_submodule(name)
+            inputs = _copy_channels(layer, given, inputs, f"{source}: {name}")
+    restore_batchnorm(network, [images], identities)
+    return f"grown into another network, convolutions added: {len(identities)}, left out: {left_out}"
 
 
 def _blocks(stage: nn.Module) -> list[nn.Module]:
+    """Return the convolutions of a stage, each with its BatchNorm."""
     return [part for part in stage.children() if isinstance(part, nn.Sequential)]
 
 
-def _take(layer: nn.Module, given: nn.Module, heard: int, place: str) -> int:
-    """Put a trained convolution and its BatchNorm into the first channels of another; how many those are."""
+def _copy_channels(layer: nn.Module, given: nn.Module, inputs: int, place: str) -> int:
+    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return their number.
+
+    ``inputs`` : number of input channels that are trained. ``place`` : name of the layer, for messages.
+    """
     own, theirs = (cast(nn.Conv2d, getattr(part, "conv", part)) for part in (layer, given))
     width = theirs.out_channels
     if width > own.out_channels:
         raise DataError(f"{place} is {width} wide, expected at most {own.out_channels}")
     own.weight[:width] = 0
-    own.weight[:width, :heard] = theirs.weight
+    own.weight[:width, :inputs] = theirs.weight
     cast(Tensor, own.bias)[:width] = cast(Tensor, theirs.bias)
     if layer is not own:
         kept = layer.get_submodule("bn").state_dict()
@@ -186,45 +296,3 @@ def _take(layer: nn.Module, given: nn.Module, heard: int, place: str) -> int:
             if value.ndim:
                 kept[key][:width] = value
     return width
-
-
-def initial_weights(path: str | Path, patches: Sequence[Patch]) -> tuple[dict[str, Tensor], NetworkConfig | None]:
-    """A state-dict to start from, and the sizes of its network where they are told.
-
-    Published SuperPoint weights, the running mean of a checkpoint, or an ONNX file of ``kpbench export-model``,
-    ``superpoint`` and ``superpoint-small`` being those that ship. An ID head for other designs is left out.
-    """
-    path = _shipped(path)
-    if path.suffix == ".onnx":
-        content, weights = _read_exported(path)
-    else:
-        weights = read_weights(path)
-        mean = {key.removeprefix("mean."): value for key, value in weights.items() if key.startswith("mean.")}
-        if not mean:
-            return weights, None
-        content, weights = read_checkpoint(path)[0], mean
-    same = content.get("designs") == designs_digest(patches)
-    kept = {key: value for key, value in weights.items() if same or not key.startswith("descriptor_attached")}
-    return kept, parse_recipe(content["recipe"], str(path)).network if "recipe" in content else None
-
-
-def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """(content, weights) of an ONNX file of ``kpbench export-model``."""
-    import onnx
-
-    try:
-        model = onnx.load(path)
-        content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
-    except Exception as error:  # protobuf's own, which is not public, among others
-        why = (str(error) or type(error).__name__).splitlines()[0][:200]
-        raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
-    if "int8" in content:
-        raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
-    if content.get("recipe", {}).get("network", {}).get("norm") == "after":
-        raise DataError(f"{path}: its BatchNorm, after the activation, cannot be put back; start from its checkpoint")
-    return content, {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
-
-
-def _shipped(path: str | Path) -> Path:
-    ours = PACKAGE / "detectors" / "weights" / f"{path}.onnx"
-    return ours if ours.is_file() and not Path(path).is_file() else Path(path)

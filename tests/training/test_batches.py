@@ -8,8 +8,8 @@ from kpbench.errors import DataError
 from kpbench.geometry.homography import project_disc
 from kpbench.patches.design import shipped_patches
 from kpbench.render.placement import Limits, Placement
-from kpbench.training.batches import Job, SampleConfig, load_photos, make_batch, training_batches
-from kpbench.training.crops import Disc, _paint_all, _poses
+from kpbench.training.batches import BatchJob, SampleConfig, load_photos, make_batch, training_batches
+from kpbench.training.crops import Disc, _paint_all, _poses_at
 
 PATCHES = shipped_patches()
 CROPS = SampleConfig(size=(96, 96))
@@ -74,7 +74,7 @@ def test_what_is_drawn_is_the_design_about_the_keypoint():
 @given(st.integers(0, 2**31))
 def test_poses_keep_the_papers_limits_wherever_they_are_put(seed):
     limits, at = Limits(), np.array([[-4.0, 90.0], [30.0, 31.0]])
-    for H, place in zip(_poses(np.random.default_rng(seed), at, limits), at, strict=True):
+    for H, place in zip(_poses_at(np.random.default_rng(seed), at, limits), at, strict=True):
         assert H[:, 2] == pytest.approx([*place, 1], abs=1e-9)
         ellipse = project_disc(H)
         assert 2 * ellipse.minor >= limits.minor_axis_px - 1e-6
@@ -94,7 +94,7 @@ def test_buried_keypoints_are_ignored_and_clean_ones_are_not(monkeypatch):
 @pytest.mark.parametrize("workers", [0, 1])
 def test_training_batches_keep_the_order_of_their_jobs(workers, tmp_path):
     cv2.imwrite(str(tmp_path / "a.png"), PHOTOS[0])
-    jobs = [Job(n, 2, 0.5) for n in (5, 3, 9)]
+    jobs = [BatchJob(n, 2, 0.5) for n in (5, 3, 9)]
     got = list(training_batches(CROPS, PATCHES, tmp_path, 7, jobs, workers))
     for job, batch in zip(jobs, got, strict=True):
         assert np.array_equal(batch.images, make_batch(CROPS, PATCHES, PHOTOS[:1], 7, job.index, 2, 0.5).images)
@@ -119,4 +119,4 @@ def test_photographs_that_cannot_be_used_are_one_line(tmp_path, workers):
     cv2.imwrite(str(tmp_path / "1.png"), np.zeros((5, 5), np.uint8))  # smaller than any window
     cv2.imwrite(str(tmp_path / "2.png"), np.zeros((8, 2000), np.uint8))  # and so are 640 columns of it
     with pytest.raises(DataError, match="none of the 2 photographs for training can be decoded"):
-        list(training_batches(SampleConfig(), shipped_patches(), tmp_path, 0, [Job(0, 2, 0.0)], workers))
+        list(training_batches(SampleConfig(), shipped_patches(), tmp_path, 0, [BatchJob(0, 2, 0.0)], workers))

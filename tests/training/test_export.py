@@ -10,12 +10,12 @@ import torch
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.patches.design import shipped_patches
-from kpbench.training.export import export_onnx, fold, to_onnx
-from kpbench.training.loop import train
+from kpbench.training.export import export_onnx, fold_batchnorm, to_onnx
+from kpbench.training.loop import TrainOptions, train
 from kpbench.training.network import SuperPoint
 from kpbench.training.quantise import export_int8
 from kpbench.training.recipe import NetworkConfig, Phase, Recipe
-from kpbench.training.weights import initial_weights
+from kpbench.training.weights import read_initial_weights
 
 SIZES = {"widths": (4, 4, 8, 8), "depths": (1, 2, 1, 1), "head_width": 8, "descriptor_width": 8}
 
@@ -40,7 +40,7 @@ def test_onnx_gives_what_pytorch_gives_at_any_size(norm, down):
     images = [torch.rand(b, 1, h, w) for b, h, w in ((1, 64, 64), (3, 8, 24), (1, 104, 72))]
     with torch.inference_mode():
         expected = [[part.numpy() for part in network(image)] for image in images]
-    session = onnxruntime.InferenceSession(to_onnx(fold(network), {}), providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(to_onnx(fold_batchnorm(network), {}), providers=["CPUExecutionProvider"])
     for image, wanted in zip(images, expected, strict=True):
         got = session.run(None, {"image": image.numpy()})
         for a, b in zip(got, wanted, strict=True):
@@ -49,7 +49,7 @@ def test_onnx_gives_what_pytorch_gives_at_any_size(norm, down):
 
 
 def test_folding_leaves_no_batchnorm_in_the_graph():
-    model = onnx.load_from_string(to_onnx(fold(lively(NetworkConfig(**SIZES))), {}))
+    model = onnx.load_from_string(to_onnx(fold_batchnorm(lively(NetworkConfig(**SIZES))), {}))
     kinds = {node.op_type for node in model.graph.node}
     assert kinds <= {"Conv", "Relu", "MaxPool", "Identity"}
 
@@ -61,7 +61,7 @@ def run(tmp_path_factory):
     recipe = Recipe("tiny", (Phase(8),), network=NetworkConfig(**SIZES), batch=4)
     (folder / "photos").mkdir()
     cv2.imwrite(str(folder / "photos" / "a.png"), np.full((64, 64), 99, np.uint8))
-    assert train(recipe, folder, folder / "photos", workers=0, validation_images=1)
+    assert train(recipe, folder, folder / "photos", options=TrainOptions(workers=0, validation_images=1))
     return folder, export_onnx(folder / "checkpoint.safetensors", folder / "tiny.onnx")
 
 
@@ -79,9 +79,9 @@ def test_export_writes_the_mean_weights_and_says_what_they_are(run):
 
 def test_eight_bits_give_nearly_the_same_and_always_the_same_file(run, tmp_path):
     exact = run[0] / "tiny.onnx"
-    said = [export_int8(exact, tmp_path / name) for name in ("a.onnx", "b.onnx")]
+    done = [export_int8(exact, tmp_path / name) for name in ("a.onnx", "b.onnx")]
     assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
-    assert said[0] == said[1]
+    assert done[0] == done[1]
     image = np.random.default_rng(1).random((2, 1, 40, 56), np.float32)
     both = (
         onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"]).run(None, {"image": image})
@@ -98,7 +98,7 @@ def test_eight_bits_come_from_an_exported_file_and_lead_nowhere(run, tmp_path):
     with pytest.raises(DataError, match=r"int8\.onnx: expected a float32 network"):
         export_int8(tmp_path / "int8.onnx", tmp_path / "twice.onnx")
     with pytest.raises(DataError, match=r"int8\.onnx: holds 8-bit integers; start from the float32 file"):
-        initial_weights(tmp_path / "int8.onnx", shipped_patches())
+        read_initial_weights(tmp_path / "int8.onnx", shipped_patches())
     with pytest.raises(DataError, match=r"checkpoint\.safetensors: cannot be read as an ONNX file"):
         export_int8(folder / "checkpoint.safetensors", tmp_path / "no.onnx")
 

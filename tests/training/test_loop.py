@@ -16,15 +16,20 @@ from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.patches.design import shipped_patches
-from kpbench.training import loop as training
 from kpbench.training.batches import Batch, SampleConfig
-from kpbench.training.checkpoint import network_of, read_checkpoint
+from kpbench.training.checkpoint import load_mean_network, read_checkpoint, start_state
 from kpbench.training.export import export_onnx
-from kpbench.training.recipe import LossConfig, NetworkConfig, Phase, Recipe, load_recipe
-from kpbench.training.weights import initial_weights
+from kpbench.training.loop import TrainOptions, train
+from kpbench.training.process_group import ProcessGroup
+from kpbench.training.recipe import LossConfig, NetworkConfig, Phase, Recipe, load_recipe, parse_recipe
+from kpbench.training.step import train_step
+from kpbench.training.validation import validate_network
+from kpbench.training.weights import read_initial_weights
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), down="stride", head_width=8, descriptor_width=8)
+PATCHES = shipped_patches()
+ALONE = ProcessGroup(0, 1, torch.device("cpu"))
 RECIPE = Recipe("tiny", (Phase(16), Phase(16, severity=(0.0, 1.0))), network=TINY, batch=4, ema=0.9)
 
 
@@ -40,8 +45,9 @@ def photos(tmp_path_factory):
 
 @pytest.fixture
 def run(photos):
-    def call(recipe, out, **options):
-        return training.train(recipe, out, photos, **{"workers": 0, "validation_images": 1} | options)
+    def call(recipe, out, patches=PATCHES, say=lambda line: None, **options):
+        options = TrainOptions(**{"workers": 0, "validation_images": 1} | options)
+        return train(recipe, out, photos, patches=patches, options=options, say=say)
 
     return call
 
@@ -56,11 +62,11 @@ def same(a, b):
 
 @pytest.fixture
 def stop_after(monkeypatch):
-    """Make the loop stop by itself after so many steps, as ``--minutes`` would."""
+    """Make the loop stop by itself after so many steps, as ``minutes`` would."""
 
     def arm(steps):
-        agree, count = training._agree, iter(range(1, 10**6))
-        monkeypatch.setattr(training, "_agree", lambda stop, *rest: agree(stop or next(count) == steps, *rest))
+        count = iter(range(1, 10**6))
+        monkeypatch.setattr(ProcessGroup, "any_of", lambda group, stop: stop or next(count) == steps)
 
     return arm
 
@@ -72,7 +78,7 @@ def test_interrupted_and_resumed_equals_undisturbed_to_the_bit(tmp_path, run, st
     stop_after(3)
     assert not run(recipe, tmp_path / "parts")
     assert not same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
-    assert run(recipe, tmp_path / "parts", resume_run=True)
+    assert run(recipe, tmp_path / "parts", resume=True)
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
 
 
@@ -82,8 +88,7 @@ def test_interrupted_and_resumed_equals_undisturbed_to_the_bit(tmp_path, run, st
         (128, "30 tensors matched; not in it: nothing"),
         (
             144,
-            "30 tensors matched; not in it: nothing; "
-            "taken into another network, convolutions that pass on: 0, left out: 0",
+            "30 tensors matched; not in it: nothing; grown into another network, convolutions added: 0, left out: 0",
         ),
     ],
 )
@@ -91,36 +96,36 @@ def test_shipped_weights_are_trained_on_from_what_they_find(tmp_path, run, head_
     recipe = replace(load_recipe(CONFIGS / "reference.toml"), batch=4, lr=1e-12)
     recipe = replace(recipe, phases=(Phase(4, "attached"),))  # one step that leaves everything as it is
     recipe = replace(recipe, network=replace(recipe.network, head_width=head_width))
-    said = []
-    assert run(recipe, tmp_path, init="superpoint-small", say=said.append)
-    assert said == [f"superpoint-small: {line}"]
+    lines = []
+    assert run(recipe, tmp_path, init="superpoint-small", say=lines.append)
+    assert lines == [f"superpoint-small: {line}"]
     content, tensors = read_checkpoint(tmp_path / "checkpoint.safetensors")
     detector = SuperPointDetector(PACKAGE / "detectors" / "weights" / "superpoint-small.onnx")  # not in 8 bits
     images = np.random.default_rng(0).integers(0, 256, (2, 64, 72), np.uint8)
     with torch.inference_mode():
-        ours = network_of(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
+        ours = load_mean_network(content, tensors)(torch.from_numpy(images)[:, None].float() / 255)
     for mine, theirs in zip(ours, detector.heads(list(images)), strict=True):
         assert np.abs(mine.numpy() - theirs).max() < 1e-3
 
 
 def test_other_designs_leave_out_the_id_head_of_an_exported_file():
-    weights, _ = initial_weights("superpoint-small", shipped_patches()[::-1])
+    weights, _ = read_initial_weights("superpoint-small", shipped_patches()[::-1])
     assert "descriptor_attached.weight" not in weights
     with pytest.raises(DataError, match="cannot be read as an ONNX model"):
-        initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
+        read_initial_weights(Path(__file__).with_suffix(".onnx"), shipped_patches())
 
 
 def test_a_checkpoint_is_trained_on_grown_and_for_other_designs_without_its_id_head(tmp_path, run):
     run(RECIPE, tmp_path / "first")
     first = tmp_path / "first" / "checkpoint.safetensors"
-    said = []
-    run(RECIPE, tmp_path / "same", init=first, say=said.append)
-    run(RECIPE, tmp_path / "others", init=first, say=said.append, patches=shipped_patches()[::-1])
-    run(replace(RECIPE, network=replace(TINY, head_width=16)), tmp_path / "wider", init=first, say=said.append)
-    assert [line.removeprefix(f"{first}: ") for line in said] == [
+    lines = []
+    run(RECIPE, tmp_path / "same", init=first, say=lines.append)
+    run(RECIPE, tmp_path / "others", init=first, say=lines.append, patches=shipped_patches()[::-1])
+    run(replace(RECIPE, network=replace(TINY, head_width=16)), tmp_path / "wider", init=first, say=lines.append)
+    assert [line.removeprefix(f"{first}: ") for line in lines] == [
         "52 tensors matched; not in it: nothing",
         "50 tensors matched; not in it: descriptor_attached",
-        "52 tensors matched; not in it: nothing; taken into another network, convolutions that pass on: 0, left out: 0",
+        "52 tensors matched; not in it: nothing; grown into another network, convolutions added: 0, left out: 0",
     ]
 
 
@@ -129,7 +134,7 @@ def test_an_exported_file_whose_batchnorm_is_lost_is_refused(tmp_path, run):
     run(after, tmp_path)
     export_onnx(tmp_path / "checkpoint.safetensors", tmp_path / "a.onnx")
     with pytest.raises(DataError, match=r"a\.onnx: its BatchNorm, .* cannot be put back; start from its checkpoint"):
-        initial_weights(tmp_path / "a.onnx", shipped_patches())
+        read_initial_weights(tmp_path / "a.onnx", shipped_patches())
 
 
 def test_worker_processes_change_nothing(tmp_path, run):
@@ -152,11 +157,11 @@ def test_sixteen_images_are_learnt_by_heart():
         sectors = np.floor(np.arctan2(rows, columns) / np.pi * (1 + n % 4)).astype(int) % 2
         images[n][inside] = np.where(sectors, 255, 0)[inside]
         keypoints[n, 0] = x, y, n % 4, 0
-    state = training.start(recipe, torch.device("cpu"))
+    state = start_state(recipe, torch.device("cpu"))
     blob, wanted = torch.from_numpy(images), torch.from_numpy(keypoints)
     for _ in range(200):
-        training.step_once(state, state.network, blob, wanted, 1)
-    figures = training.evaluate(state.mean, [("heart", Batch(images, keypoints))])
+        train_step(state, state.network, blob, wanted, ALONE)
+    figures = validate_network(state.mean, [("heart", Batch(images, keypoints))])
     assert figures["heart_found_1px"] == 1.0
     assert figures["heart_id"] == 1.0
     assert figures["heart_alarms"] == 0.0
@@ -164,7 +169,7 @@ def test_sixteen_images_are_learnt_by_heart():
 
 def test_the_first_phase_leaves_all_but_the_attached_layers_alone(tmp_path, run):
     recipe = replace(RECIPE, phases=(Phase(16, trains="attached"),))
-    fresh = training.start(recipe, torch.device("cpu")).network.state_dict()
+    fresh = start_state(recipe, torch.device("cpu")).network.state_dict()
     run(recipe, tmp_path)
     after = {k.removeprefix("network."): v for k, v in tensors(tmp_path).items() if k.startswith("network.")}
     changed = {k for k in fresh if not torch.equal(fresh[k], after[k])}
@@ -192,10 +197,30 @@ def test_the_papers_recipe_is_the_papers():
     assert recipe.network == NetworkConfig(norm="after")
 
 
+def test_the_papers_recipe_runs_its_three_phases(tmp_path, run):
+    recipe = load_recipe("paper")
+    small = replace(recipe.network, widths=(4, 4, 8, 8), head_width=8, descriptor_width=8)
+    scenes = replace(recipe.samples, size=(96, 64), set_size=4)
+    phases = tuple(replace(phase, samples=8) for phase in recipe.phases)
+    recipe = replace(recipe, network=small, samples=scenes, phases=phases, batch=4, decay_at=(8, 24))
+    assert [recipe.phase(step)[0].trains for step in range(6)] == ["attached"] * 2 + ["all"] * 4
+    assert [recipe.phase(step)[1] for step in range(6)] == [0, 0, 0, 0, 1, 1]
+    assert run(recipe, tmp_path)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert lines[-1]["samples"] == 24
+    assert np.isfinite([lines[-2]["loss"], lines[-2]["id_loss"]]).all()
+
+
+def test_a_recipe_that_ships_is_found_by_its_name():
+    assert load_recipe("paper") == load_recipe(CONFIGS / "paper.toml")
+    with pytest.raises(
+        DataError, match="there is no recipe 'papers', only: finetune, paper, reference, superpoint, or"
+    ):
+        load_recipe("papers")
+
+
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.toml")), ids=lambda p: p.name)
 def test_shipped_recipes_survive_the_checkpoint(path):
-    from kpbench.training.recipe import parse_recipe
-
     recipe = load_recipe(path)
     assert parse_recipe(json.loads(json.dumps(asdict(recipe))), "json") == recipe
 
@@ -230,14 +255,14 @@ def test_a_bad_recipe_is_one_line_with_the_place(tmp_path, text, message):
 def test_a_checkpoint_of_another_recipe_or_design_set_is_refused(tmp_path, run):
     run(RECIPE, tmp_path)
     with pytest.raises(DataError, match="was trained with another lr and ema; use another folder"):
-        run(replace(RECIPE, lr=0.1, ema=0.5), tmp_path, resume_run=True)
+        run(replace(RECIPE, lr=0.1, ema=0.5), tmp_path, resume=True)
     with pytest.raises(DataError, match="was trained on other patch designs"):
-        run(RECIPE, tmp_path, resume_run=True, patches=shipped_patches()[::-1])
-    with pytest.raises(DataError, match="use --resume"):
+        run(RECIPE, tmp_path, resume=True, patches=shipped_patches()[::-1])
+    with pytest.raises(DataError, match="use `resume`"):
         run(RECIPE, tmp_path)
     (tmp_path / "checkpoint.safetensors").write_bytes(b"cut off")
     with pytest.raises(DataError, match="cannot be read as a checkpoint"):
-        run(RECIPE, tmp_path, resume_run=True)
+        run(RECIPE, tmp_path, resume=True)
 
 
 def test_the_log_holds_losses_and_validation(tmp_path, run):
@@ -268,7 +293,7 @@ def test_evaluation_counts_what_is_there():
             ids[:, 1] = 1
             return detector, ids
 
-    figures = training.evaluate(Oracle(), [("a", Batch(np.zeros((1, 80, 80), np.uint8), keypoints))])
+    figures = validate_network(Oracle(), [("a", Batch(np.zeros((1, 80, 80), np.uint8), keypoints))])
     assert figures == {"a_found_3px": 0.5, "a_found_1px": 0.0, "a_id": 0.0, "a_alarms": 1.0}
 
 
@@ -280,20 +305,22 @@ def test_two_processes_train_one_network(tmp_path, photos):
         "[network]\nwidths = [4, 4, 8, 8]\ndepths = [1, 1, 1, 1]\nhead_width = 8\ndescriptor_width = 8\n"
     )
     code = (
-        "import hashlib, sys, torch\n"
+        "import hashlib, os, sys, torch\n"
         "from pathlib import Path\n"
         "from kpbench.training import loop as t\n"
+        "from kpbench.training.process_group import dist\n"
         "from kpbench.training.recipe import load_recipe\n"
-        "step = t.step_once\n"
+        "step = t.train_step\n"
         "def watched(state, *rest):\n"
         "    pair = step(state, *rest)\n"
         "    flat = torch.cat([p.flatten() for p in state.network.parameters()])\n"
-        "    out = Path(sys.argv[2]) / f'{state.step}-{t.os.environ[\"RANK\"]}'\n"
+        "    out = Path(sys.argv[2]) / f'{state.step}-{os.environ[\"RANK\"]}'\n"
         "    out.write_text(hashlib.sha256(flat.detach().numpy().tobytes()).hexdigest())\n"
         "    return pair\n"
-        "t.step_once = watched\n"
-        "t.train(load_recipe(sys.argv[1]), sys.argv[2], sys.argv[3], workers=0, threads=1, validation_images=1)\n"
-        "t.dist.destroy_process_group()\n"
+        "t.train_step = watched\n"
+        "options = t.TrainOptions(workers=0, threads=1, validation_images=1)\n"
+        "t.train(load_recipe(sys.argv[1]), sys.argv[2], sys.argv[3], options=options)\n"
+        "dist.destroy_process_group()\n"
     )
     port = str(20_000 + os.getpid() % 20_000)
     environment = os.environ | {
@@ -318,19 +345,18 @@ def test_two_processes_train_one_network(tmp_path, photos):
 
 def test_an_interrupt_ends_after_the_step_with_a_checkpoint_that_resumes(tmp_path, run, monkeypatch):
     before = signal.getsignal(signal.SIGINT)
-    step = training.step_once
 
     def interrupted(state, *rest):
         if state.step == 2:
             os.kill(os.getpid(), signal.SIGINT)
-        return step(state, *rest)
+        return train_step(state, *rest)
 
     run(RECIPE, tmp_path / "whole")
     with monkeypatch.context() as patched:
-        patched.setattr(training, "step_once", interrupted)
-        with pytest.raises(KeyboardInterrupt, match="is at step 3; the same command with --resume goes on"):
+        patched.setattr("kpbench.training.loop.train_step", interrupted)
+        with pytest.raises(KeyboardInterrupt, match="is at step 3; the same command with `resume` goes on"):
             run(RECIPE, tmp_path / "parts")
     assert signal.getsignal(signal.SIGINT) is before  # ignored, not the default, in a shell's background job
     # "the same command", whatever that started from
-    assert run(RECIPE, tmp_path / "parts", resume_run=True, init="superpoint-small")
+    assert run(RECIPE, tmp_path / "parts", resume=True, init="superpoint-small")
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))

@@ -7,10 +7,10 @@ import torch
 from safetensors.torch import save_file
 
 from kpbench.errors import DataError
-from kpbench.training.losses import losses, make_targets
+from kpbench.training.losses import compute_losses, make_targets
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import LossConfig, NetworkConfig
-from kpbench.training.weights import grow, initialise, read_weights
+from kpbench.training.weights import grow_network, load_into_network, read_weights
 
 TINY = NetworkConfig(widths=(4, 4, 8, 8), depths=(1, 1, 1, 1), head_width=8, descriptor_width=8)
 
@@ -61,7 +61,7 @@ def test_published_weights_fit_and_the_attached_layers_stay_fresh(tmp_path, suff
     save_file(tensors, path) if suffix == ".safetensors" else torch.save(tensors, path)
     network = SuperPoint(NetworkConfig(norm="after"))
     attached = [p.clone() for p in network.attached]
-    line = initialise(network, read_weights(path), path.name)
+    line = load_into_network(network, read_weights(path), path.name)
     assert line == f"weights{suffix}: 72 tensors matched; not in it: descriptor_attached, detector_attached"
     assert torch.equal(network.backbone[3][1].conv.weight, tensors["backbone.3.1.conv.weight"])
     assert torch.equal(network.descriptor[1].bn.running_var, tensors["descriptor.1.bn.running_var"])
@@ -88,7 +88,7 @@ def change(name, value):
 def test_weights_that_do_not_fit_are_refused(name, value, message):
     network = SuperPoint(NetworkConfig(norm="after"))
     with pytest.raises(DataError, match=f"^{message}$"):
-        initialise(network, change(name, value), "f")
+        load_into_network(network, change(name, value), "f")
 
 
 @pytest.mark.parametrize("down", ["max", "stride"])
@@ -100,8 +100,8 @@ def test_a_grown_network_computes_what_the_smaller_one_does(down):
             torch.nn.init.uniform_(tensor, 0.5, 1.5)
     network = SuperPoint(NetworkConfig((6, 4, 12, 16), (2, 2, 1, 3), down, 12, 8)).eval()
     images = torch.rand(4, 1, 40, 56)
-    line = grow(network, smaller, images, "small.onnx")
-    assert line == "taken into another network, convolutions that pass on: 3, left out: 0"
+    line = grow_network(network, smaller, images, "small.onnx")
+    assert line == "grown into another network, convolutions added: 3, left out: 0"
     with torch.no_grad():
         for mine, theirs in zip(network(images), smaller(images), strict=True):
             assert theirs.std() > 0.01
@@ -111,8 +111,8 @@ def test_a_grown_network_computes_what_the_smaller_one_does(down):
 def test_convolutions_beyond_a_stages_depth_are_left_out_whatever_halves():
     smaller = SuperPoint(NetworkConfig((4, 4, 8, 8), (1, 2, 2, 4), "stride", 8, 8)).eval()
     network = SuperPoint(NetworkConfig((6, 4, 12, 8), (2, 2, 1, 2), "max", 12, 8)).eval()
-    line = grow(network, smaller, torch.rand(4, 1, 40, 56), "small.onnx")
-    assert line == "taken into another network, convolutions that pass on: 1, left out: 3"
+    line = grow_network(network, smaller, torch.rand(4, 1, 40, 56), "small.onnx")
+    assert line == "grown into another network, convolutions added: 1, left out: 3"
     for stage, layer in ((0, 0), (1, 0), (1, 1), (2, 0), (3, 0), (3, 1)):
         own, theirs = (net.backbone[stage][layer].conv.weight for net in (network, smaller))
         assert torch.equal(own[: len(theirs), : theirs.shape[1]], theirs)
@@ -133,7 +133,7 @@ def test_convolutions_beyond_a_stages_depth_are_left_out_whatever_halves():
 def test_what_is_larger_somewhere_does_not_grow(change, message):
     network = SuperPoint(replace(TINY, **change))
     with pytest.raises(DataError, match=f"^{re.escape(message)}$"):
-        grow(network, SuperPoint(TINY), torch.zeros(1, 1, 16, 16), "small.onnx")
+        grow_network(network, SuperPoint(TINY), torch.zeros(1, 1, 16, 16), "small.onnx")
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".safetensors"])
@@ -220,10 +220,10 @@ def test_perfect_heads_lose_nothing_and_wrong_ones_do(identity):
     if identity == "hinge":  # a keypoint's class belongs to the cell that it lies in alone
         inside = targets.place[:, 64] < 1
         ids = 50 * torch.nn.functional.one_hot(torch.where(inside, targets.identity, 4), 5).permute(0, 3, 1, 2).float()
-    located, identified = losses(detector, ids, targets, config)
+    located, identified = compute_losses(detector, ids, targets, config)
     assert located.item() == pytest.approx(0, abs=1e-6)
     assert identified.item() == pytest.approx(0, abs=1e-6)
-    located, identified = losses(detector.roll(1, 1), ids.roll(1, 1), targets, config)
+    located, identified = compute_losses(detector.roll(1, 1), ids.roll(1, 1), targets, config)
     assert located > 1
     assert identified > 0.1
 
@@ -246,12 +246,12 @@ def test_hinge_equals_the_sum_over_pairs_of_cells():
             elif classes[a] != classes[b]:
                 total += max(0.0, dot - 0.2)
     detector = torch.zeros(1, 65, 4, 5)
-    assert losses(detector, ids, targets, config)[1].item() == pytest.approx(total / 400, rel=1e-5)
+    assert compute_losses(detector, ids, targets, config)[1].item() == pytest.approx(total / 400, rel=1e-5)
 
 
 def test_focal_weight_spares_what_is_already_right():
     targets = make_targets(one_keypoint(20.0, 20.0), 64, 64, 4, "pixel")
     ids = torch.zeros(1, 5, 8, 8)
     right = 6 * targets.place
-    plain, focal = (losses(right, ids, targets, LossConfig(focal=f))[0] for f in (0.0, 2.0))
+    plain, focal = (compute_losses(right, ids, targets, LossConfig(focal=f))[0] for f in (0.0, 2.0))
     assert focal < 0.2 * plain

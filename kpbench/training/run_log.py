@@ -1,0 +1,104 @@
+"""What a training tells while it runs: ``log.jsonl``, TensorBoard's files, a progress bar."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from kpbench.training.checkpoint import TrainingState
+
+Record = Callable[[TrainingState, Mapping[str, Any]], None]
+"""A function that writes figures at the current step."""
+
+
+@contextmanager
+def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
+    """Append figures to ``log.jsonl`` and, if asked for, to TensorBoard's files; yields the function to call."""
+    if not active:
+        yield lambda state, figures: None
+        return
+    writer: Any = None
+    if tensorboard:
+        from torch.utils.tensorboard import SummaryWriter
+
+        writer = SummaryWriter(folder)
+    with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
+
+        def record(state: TrainingState, figures: Mapping[str, Any]) -> None:
+            rounded = {k: float(f"{v:.5g}") for k, v in figures.items()}
+            at = {
+                "step": state.step,
+                "samples": state.step * state.recipe.batch,
+                "minutes": round(state.seconds / 60, 2),
+            }
+            log.write(json.dumps(at | rounded) + "\n")
+            log.flush()
+            for key, value in figures.items() if writer else ():
+                writer.add_scalar(key, value, at["samples"])
+
+        yield record
+    if writer:
+        writer.close()
+
+
+@contextmanager
+def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
+    """Show a progress bar over samples, only on a terminal; yields a function of the step and of a text."""
+    batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
+    hidden = not active or not sys.stderr.isatty()
+    with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
+
+        def advance(step: int, text: str) -> None:
+            bar.set_postfix_str(text, refresh=False)
+            bar.update(step * batch - bar.n)
+
+        yield advance
+
+
+class LossMeter:
+    """Mean losses since the last reading, and samples per second since the training began."""
+
+    def __init__(self, state: TrainingState, device: torch.device, began: float) -> None:
+        self._began, self._first = began, state.step
+        self._sums, self._since = torch.zeros(2, device=device), state.step
+
+    def add(self, losses: tuple[Tensor, Tensor]) -> None:
+        """Add the losses of a step."""
+        self._sums += torch.stack(losses)
+
+    def read(self, state: TrainingState) -> dict[str, float]:
+        """Return the figures for the log, and begin new means."""
+        detector_loss, identity_loss = (self._sums / (state.step - self._since)).tolist()
+        samples = (state.step - self._first) * state.recipe.batch
+        self._sums.zero_()
+        self._since = state.step
+        return {
+            "loss": detector_loss,
+            "id_loss": identity_loss,
+            "lr": state.recipe.rate(state.step),
+            "samples_s": samples / (time.monotonic() - self._began),
+        }
+
+
+class Timer:
+    """Tells when a time has passed since the beginning or the last restart."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds, self._since = seconds, time.monotonic()
+
+    def due(self) -> bool:
+        """Return whether the time has passed."""
+        return time.monotonic() - self._since > self._seconds
+
+    def restart(self) -> None:
+        """Begin anew."""
+        self._since = time.monotonic()
