@@ -14,7 +14,7 @@ from kpbench.analysis.figure import FIGURE_SUFFIXES, design_figure
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.printing.formats import WRITERS
+from kpbench.printing.formats import PAGE_WRITERS
 from kpbench.render.background import PhotoFolder, procedural_background
 from kpbench.types import UInt8
 
@@ -99,7 +99,7 @@ def analyse_patches(
         content = analysis.to_dict() | ({"search": found.to_dict()} if found else {})
         write_atomic(Path(json_file), (json.dumps(content, indent=1) + "\n").encode())
     if figure_file is not None:
-        write_atomic(Path(figure_file), WRITERS[suffix]([design_figure(analysis, measured)], FIGURE_DPI)[0])
+        write_atomic(Path(figure_file), PAGE_WRITERS[suffix]([design_figure(analysis, measured)], FIGURE_DPI)[0])
     return AnalysedPatches(measured, analysis, found)
 
 
