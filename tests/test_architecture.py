@@ -20,7 +20,6 @@ import pytest
 
 import kpbench
 
-MOVING = pytest.mark.xfail(reason="the house is being built")
 PACKAGE = Path(kpbench.__file__).parent
 MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__main__.py")
 
@@ -193,7 +192,6 @@ def test_neither_the_package_nor_the_list_of_commands_loads_what_is_heavy(code):
     assert done.stdout.splitlines()[-1].strip() == "loaded:"
 
 
-@MOVING
 def test_public_functions_stay_callable_when_every_module_is_imported():
     """A module of the name of a public function would replace it once it is imported."""
     for module in pkgutil.walk_packages([str(PACKAGE)], "kpbench."):
@@ -204,7 +202,6 @@ def test_public_functions_stay_callable_when_every_module_is_imported():
             assert not inspect.ismodule(getattr(room, name)), f"{room.__name__}.{name}"
 
 
-@MOVING
 def test_no_module_has_the_name_of_a_public_name_beside_it():
     for folder in [PACKAGE, *(PACKAGE / name for name in ROOMS if (PACKAGE / name).is_dir())]:
         room = importlib.import_module(".".join(["kpbench", *folder.relative_to(PACKAGE).parts]))
@@ -217,14 +214,12 @@ def strings(path):
     return [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
 
 
-@MOVING
 @pytest.mark.parametrize("path", [path for path in MODULES if in_library(path)], ids=name_of)
 def test_the_library_never_speaks_of_options(path):
     """It names parameters, in backticks; the command line translates."""
     assert not [text for text in strings(path) if re.search(r"(?<![\w-])--(n\b|[a-z][a-z])", text)]
 
 
-@MOVING
 def test_files_and_functions_are_short():
     assert long_files().keys() == LARGE_FILES.keys()
     assert long_functions().keys() == LARGE_FUNCTIONS.keys()
@@ -244,7 +239,6 @@ def public_names(path):
         yield from (name for name in names if not name.startswith("_"))
 
 
-@MOVING
 def test_no_two_modules_define_one_public_name():
     homes = defaultdict(set)
     for path in filter(in_library, MODULES):

@@ -15,16 +15,10 @@ import numpy as np
 from kpbench import shipped_patches
 from kpbench.analysis import search
 from kpbench.analysis.cell_images import Grid, attitudes
-from kpbench.analysis.measures import (
-    SIZES_PX,
-    basin,
-    bound,
-    correlation_and_distance,
-    disc_bound,
-    natural_response,
-    pixels_needed,
-    sample_windows,
-)
+from kpbench.analysis.identity import correlation_and_distance
+from kpbench.analysis.localisation import basin, bound, disc_bound
+from kpbench.analysis.measures import SIZES_PX, pixels_needed
+from kpbench.analysis.natural_images import natural_response, sample_windows
 from kpbench.render import procedural_background
 
 HERE = Path(__file__).parents[1] / "designs"

@@ -1,5 +1,5 @@
+from .localisation import Bound as Bound
 from .measures import Analysis as Analysis
-from .measures import Bound as Bound
 from .measures import DesignReport as DesignReport
 from .pipeline import AnalysedPatches as AnalysedPatches
 from .pipeline import analyse_patches as analyse_patches

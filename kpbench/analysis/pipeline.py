@@ -9,8 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from kpbench.analysis import measures, search
+from kpbench.analysis import search
 from kpbench.analysis.figure import FIGURE_SUFFIXES, design_figure
+from kpbench.analysis.measures import ANALYSIS_STEPS, Analysis, analyse
+from kpbench.analysis.natural_images import sample_windows
+from kpbench.analysis.search import SEARCH_STEPS
 from kpbench.errors import DesignError
 from kpbench.files import write_atomic
 from kpbench.patches.design import Patch, shipped_patches
@@ -38,7 +41,7 @@ class AnalysedPatches:
     """
 
     patches: tuple[Patch, ...]
-    analysis: measures.Analysis
+    analysis: Analysis
     search: search.SearchResult | None
 
 
@@ -94,7 +97,7 @@ def analyse_patches(
     windows = background_windows(backgrounds)
     found = search.search(windows, shipped_patches(), progress=progress) if search_family else None
     measured = found.sets[0] if found else tuple(patches or shipped_patches())
-    analysis = measures.analyse(measured, windows, progress)
+    analysis = analyse(measured, windows, progress)
     if json_file is not None:
         content = analysis.to_dict() | ({"search": found.to_dict()} if found else {})
         write_atomic(Path(json_file), (json.dumps(content, indent=1) + "\n").encode())
@@ -105,7 +108,7 @@ def analyse_patches(
 
 def count_steps(search_family: bool = False) -> int:
     """Return how often :func:`analyse_patches` reports progress."""
-    return measures.STEPS + (search.STEPS if search_family else 0)
+    return ANALYSIS_STEPS + (SEARCH_STEPS if search_family else 0)
 
 
 def background_windows(backgrounds: str | Path | None = None) -> UInt8:
@@ -131,7 +134,7 @@ def background_windows(backgrounds: str | Path | None = None) -> UInt8:
     """
     rng = np.random.default_rng(0)
     images = _procedural(rng) if backgrounds is None else _photographs(PhotoFolder.open(backgrounds), rng)
-    return measures.sample_windows(images, rng)
+    return sample_windows(images, rng)
 
 
 def _procedural(rng: np.random.Generator) -> Iterator[UInt8]:

@@ -23,15 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.analysis.cell_images import Grid
-from kpbench.analysis.measures import (
-    PAIR_STEPS,
-    SIZES_PX,
-    basin,
-    correlation_and_distance,
-    disc_bound,
-    natural_response,
-    pixels_needed,
-)
+from kpbench.analysis.identity import PAIR_STEPS, correlation_and_distance
+from kpbench.analysis.localisation import basin, disc_bound
+from kpbench.analysis.measures import SIZES_PX, pixels_needed
+from kpbench.analysis.natural_images import natural_response
 from kpbench.patches.design import Patch, SemiCircle
 from kpbench.types import Float, Float32, UInt8
 
@@ -45,7 +40,7 @@ LEAST_BASIN = 0.10
 MOST_BOUND_PX = 0.05  # at 5 px radius, without the rim
 MOST_NATURAL = 1 / 500  # of all places with a correlation over 0.8
 SET_SIZE = 4
-STEPS = 6 + PAIR_STEPS  # calls of progress
+SEARCH_STEPS = 6 + PAIR_STEPS  # calls of progress
 
 Codes = NDArray[np.uint32]
 
@@ -245,7 +240,7 @@ def search(
     count : int
         How many sets to give.
     progress : callable
-        Called now and then, :data:`STEPS` times in all.
+        Called now and then, :data:`SEARCH_STEPS` times in all.
     """
     family = enumerate_family()
     codes = family.classes

@@ -118,7 +118,7 @@ class ScoreWeights:
         return np.asarray(self.core * np.log(1.01 - core_ncc) + self.whole * np.log(1.01 - whole_ncc))
 
 
-THRESHOLDS, WEIGHTS = Thresholds(), ScoreWeights()
+TEMPLATE_THRESHOLDS, SCORE_WEIGHTS = Thresholds(), ScoreWeights()
 
 
 def find_crossings(level: Float32) -> tuple[Float, Float]:
@@ -132,14 +132,14 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     Returns
     -------
     xy : ndarray of shape (n, 2)
-        Whole px; the strongest places, at most ``THRESHOLDS.places`` and one per ``THRESHOLDS.px_per_place`` px.
+        Whole px; the strongest places. Their number grows with the level, see :data:`TEMPLATE_THRESHOLDS`.
     strength : ndarray of shape (n,)
         In falling order.
     """
     gx = cv2.Scharr(level, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(level, cv2.CV_32F, 0, 1, scale=1 / 32)
     q = np.arange(-4.0, 5.0)
-    weight = np.exp(-(q**2) / (2 * THRESHOLDS.window_px**2))
+    weight = np.exp(-(q**2) / (2 * TEMPLATE_THRESHOLDS.window_px**2))
     moments = [weight / weight.sum() * q**n for n in range(3)]
 
     def moment(image: Float32, nx: int, ny: int) -> Float32:
@@ -154,12 +154,14 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt it falls as the area does; the smaller
     # eigenvalue, which measures like Harris' use, falls faster
     spread = np.sqrt(np.maximum(a * c - b * b, 0))
-    strength = (spread - THRESHOLDS.radial * radial) / np.sqrt(a + c + 50.0)
+    strength = (spread - TEMPLATE_THRESHOLDS.radial * radial) / np.sqrt(a + c + 50.0)
     strength[[0, -1]], strength[:, [0, -1]] = 0, 0
     peak = (strength >= cv2.dilate(strength, np.ones((3, 3), np.uint8))) & (strength > 0)
     rows, columns = np.nonzero(peak)
     found = strength[rows, columns]
-    best = np.argsort(-found, kind="stable")[: level.size // THRESHOLDS.px_per_place + THRESHOLDS.places]
+    best = np.argsort(-found, kind="stable")[
+        : level.size // TEMPLATE_THRESHOLDS.px_per_place + TEMPLATE_THRESHOLDS.places
+    ]
     return np.column_stack([columns, rows])[best].astype(np.float64), found[best].astype(np.float64)
 
 
@@ -194,11 +196,11 @@ class Candidates:
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
         relative_blur = np.minimum(self.fit.blur_px / np.maximum(short_semi_axis(self.fit.A), 0.5), 1)
         log_odds = (
-            WEIGHTS.offset
-            + WEIGHTS.likeness(self.core_ncc, self.whole_ncc)
-            + WEIGHTS.unexplained * np.log(np.minimum(unexplained, 3) + 0.02)
-            + WEIGHTS.blur * relative_blur
-            + WEIGHTS.contrast * np.log(contrast / (self.grey_range + 5))
+            SCORE_WEIGHTS.offset
+            + SCORE_WEIGHTS.likeness(self.core_ncc, self.whole_ncc)
+            + SCORE_WEIGHTS.unexplained * np.log(np.minimum(unexplained, 3) + 0.02)
+            + SCORE_WEIGHTS.blur * relative_blur
+            + SCORE_WEIGHTS.contrast * np.log(contrast / (self.grey_range + 5))
         )
         possible = (self.fit.white > self.fit.black) & np.isfinite(log_odds)
         return np.where(possible, 1 / (1 + np.exp(-np.clip(log_odds, -30, 30))), 0.0)
@@ -267,18 +269,18 @@ class TemplateDetector:
         """Return the fits of all places in a grey image that are enough like a design."""
         templates, pyramids = build_templates(self.patches), Pyramids(grey)
         raw, smooth = pyramids.raw, pyramids.smooth
-        poses = search_sectors(smooth, *_find_places(raw[0], smooth), templates, THRESHOLDS.margin)
-        poses = poses[poses.ncc > THRESHOLDS.search_ncc]
-        for steps, least_ncc in zip(THRESHOLDS.align_steps, THRESHOLDS.align_ncc, strict=True):
-            poses = align_poses(smooth, poses, templates.core, steps, THRESHOLDS.align_radius * CORE_RADIUS_PX)
+        poses = search_sectors(smooth, *_find_places(raw[0], smooth), templates, TEMPLATE_THRESHOLDS.margin)
+        poses = poses[poses.ncc > TEMPLATE_THRESHOLDS.search_ncc]
+        for steps, least_ncc in zip(TEMPLATE_THRESHOLDS.align_steps, TEMPLATE_THRESHOLDS.align_ncc, strict=True):
+            poses = align_poses(smooth, poses, templates.core, steps, TEMPLATE_THRESHOLDS.align_radius * CORE_RADIUS_PX)
             poses = poses[poses.ncc > least_ncc]
         poses = poses[np.argsort(-poses.ncc, kind="stable")]
-        most = THRESHOLDS.most_candidates
+        most = TEMPLATE_THRESHOLDS.most_candidates
         core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
         row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
-        whole = align_poses(smooth, rotated, templates.whole, THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
+        whole = align_poses(smooth, rotated, templates.whole, TEMPLATE_THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
         whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # the best rotation of each
-        alike = WEIGHTS.likeness(core.ncc, whole.ncc) > THRESHOLDS.likeness
+        alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
         return Candidates(whole.design, core.ncc, whole.ncc, fits, pyramids.noise, pyramids.grey_range)
@@ -286,7 +288,7 @@ class TemplateDetector:
 
 def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
     """Return crossings of several octaves: (n, 2) px of the image, and the octave (n,) of each."""
-    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1 : THRESHOLDS.octaves]]
+    levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1 : TEMPLATE_THRESHOLDS.octaves]]
     xy = [find_crossings(level)[0] for level in levels]
     octave = np.repeat(np.arange(len(xy)), [len(points) for points in xy])
     return np.concatenate([points * 2**n for n, points in enumerate(xy)]), octave
@@ -296,9 +298,9 @@ def _select_distinct(poses: Poses) -> Int:
     """Return indices of poses, best first; near a better pose only a nearly as good pose of another design is kept."""
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
-    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < THRESHOLDS.near
+    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < TEMPLATE_THRESHOLDS.near
     near |= near.T
-    much_better = poses.ncc[:, None] > poses.ncc + THRESHOLDS.much_better_ncc
+    much_better = poses.ncc[:, None] > poses.ncc + TEMPLATE_THRESHOLDS.much_better_ncc
     rival = near & ((poses.design[:, None] == poses.design) | much_better)
     kept = np.zeros(n, bool)
     for k in range(n):
@@ -309,7 +311,7 @@ def _select_distinct(poses: Poses) -> Int:
 def _select_uncovered(xy: Float, A: Float) -> Int:
     """Return indices of points, best first, that do not lie in the disc of a better point."""
     offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
-    inside = np.linalg.norm(offset, axis=2) < THRESHOLDS.disc_share
+    inside = np.linalg.norm(offset, axis=2) < TEMPLATE_THRESHOLDS.disc_share
     kept = np.zeros(len(xy), bool)
     for k in range(len(xy)):
         kept[k] = not np.any(inside[kept, k])

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from kpbench.geometry.outline import Line, Region, circle, rectangle
 from kpbench.printing.page import CUT, MARKS, Shape, Text
-from kpbench.printing.page_format import BLANK, MARGIN, STRIP, PageFormat
+from kpbench.printing.page_format import BLANK, PAGE_MARGIN, STRIP, PageFormat
 
 LINE = 0.1  # mm, width of every mark
 TICK_GAP, TICK = 1.0, 2.0  # mm, distance of a cut mark from the cut, and length of the mark
@@ -21,21 +21,21 @@ def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], 
     (ruler_x, ruler_y), width, height = page_format.rulers_mm, page_format.width_mm, page_format.height_mm
     inner, below = BLANK + STRIP, height - BLANK - STRIP
     shapes = [
-        Shape(_polygon((MARGIN + u, below + v) for u, v in _ruler(ruler_x)), MARKS),
-        Shape(_polygon((inner - v, height - MARGIN - u) for u, v in _ruler(ruler_y)), MARKS),
+        Shape(_polygon((PAGE_MARGIN + u, below + v) for u, v in _ruler(ruler_x)), MARKS),
+        Shape(_polygon((inner - v, height - PAGE_MARGIN - u) for u, v in _ruler(ruler_y)), MARKS),
     ]
     check = f"print at 100 %, check with a ruler: {ruler_x:g} mm"
-    end, bottom = MARGIN + ruler_x, height - BLANK - 0.6
-    foot_size = font_size(foot, width - MARGIN - end - 12)
+    end, bottom = PAGE_MARGIN + ruler_x, height - BLANK - 0.6
+    foot_size = font_size(foot, width - PAGE_MARGIN - end - 12)
     if foot_size < SMALLEST_FOOT:  # a small page has no room beside the ruler
         title, foot = f"{title}, {foot}", ""
     size = font_size(f"{title}    {check}", page_format.ink_size_mm[0])
-    x, y = BLANK + STRIP / 2, height - MARGIN - ruler_y
+    x, y = BLANK + STRIP / 2, height - PAGE_MARGIN - ruler_y
     texts = [
-        Text(title, MARGIN, BLANK + size, size),
-        Text(check, width - MARGIN, BLANK + size, size, "end"),
+        Text(title, PAGE_MARGIN, BLANK + size, size),
+        Text(check, width - PAGE_MARGIN, BLANK + size, size, "end"),
         Text(f"{ruler_x:g} mm", end + 1.5, bottom, FONT_SIZE),
-        Text(foot, width - MARGIN, bottom, foot_size, "end"),
+        Text(foot, width - PAGE_MARGIN, bottom, foot_size, "end"),
         Text(f"{ruler_y:g}", x, y - 3.2, 1.7, "middle"),
         Text("mm", x, y - 1.2, 1.7, "middle"),
     ]

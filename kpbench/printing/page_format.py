@@ -22,7 +22,7 @@ PAGE_SIZES_MM = {  # width and height; ISO 216 and ANSI Y14.1
     "legal": (215.9, 355.6),
 }
 BLANK, STRIP = 5.0, 3.0  # mm, see the module's docstring
-MARGIN = BLANK + 2 * STRIP  # mm, from the edge of the page to the area for ink
+PAGE_MARGIN = BLANK + 2 * STRIP  # mm, from the edge of the page to the area for ink
 LONGEST_RULER = 100.0  # mm
 
 
@@ -54,7 +54,7 @@ class PageFormat:
     @property
     def ink_size_mm(self) -> tuple[float, float]:
         """Width and height of the area for ink."""
-        return self.width_mm - 2 * MARGIN, self.height_mm - 2 * MARGIN
+        return self.width_mm - 2 * PAGE_MARGIN, self.height_mm - 2 * PAGE_MARGIN
 
     @property
     def rulers_mm(self) -> tuple[float, float]:

@@ -18,7 +18,7 @@ from kpbench.patches.board import Board
 from kpbench.patches.design import Patch
 from kpbench.printing.marks import TICK, TICK_GAP, crop_mark, disc_marks, font_size, frame, registration_cross
 from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, round_to_nm
-from kpbench.printing.page_format import MARGIN, PageFormat
+from kpbench.printing.page_format import PAGE_MARGIN, PageFormat
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, sidecar_entry, sidecar_head
 from kpbench.printing.tiling import Tile, cut_into_tiles
 
@@ -101,7 +101,7 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageF
         shapes, texts = frame(page_format, title, f"page {number} of {math.ceil(len(prints) / per_page)}")
         for n, patch in enumerate(prints[start : start + per_page]):
             x = page_format.width_mm / 2 + (n % columns + 0.5 - columns / 2) * cell_x
-            y = MARGIN + n // columns * cell_y + cell_x / 2
+            y = PAGE_MARGIN + n // columns * cell_y + cell_x / 2
             shapes += [_ink(patch, x, y, diameter_mm, 0.0), *disc_marks(x, y, patch.extent * diameter_mm / 2)]
             texts.append(Text(labels[patch], x, y + cell_x / 2 + LABEL_HEIGHT / 2, label_size, "middle"))
             on_paper = page_format.position_on_paper(x, y)

@@ -33,7 +33,7 @@ ENLARGED_RADIUS_PX = (4.0, 40.0)
 """Range of the radii in enlarged crops, px of the image: larger patches are found at the other scales."""
 LEAST_SIGNAL = 12.0
 """Least contrast · √area / noise of a keypoint that is asked for: 6 sigmas at the output of a matched filter."""
-LEAST_CONTRAST = 4.0
+LEAST_KEYPOINT_CONTRAST = 4.0
 """Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of a lower one."""
 
 
@@ -90,7 +90,7 @@ def make_crops(
             left = 1.0 - (kernel / (2 * disc.minor)) ** 2
             contrast = gain * (disc.placement.white - disc.placement.black) * max(left, 0.0)
             area = np.pi * disc.major * disc.minor
-            buried = contrast < max(LEAST_CONTRAST, LEAST_SIGNAL * sigma / np.sqrt(area))
+            buried = contrast < max(LEAST_KEYPOINT_CONTRAST, LEAST_SIGNAL * sigma / np.sqrt(area))
             small = disc.minor * scale.min() < 0.5 * Limits().minor_axis_px
             lost = buried or small or any(disc is h for h in hidden)
             keypoints[n, k] = x, y, disc.design, disc.major * scale.max() if lost else 0.0

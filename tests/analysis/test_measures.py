@@ -11,7 +11,11 @@ from hypothesis.extra.numpy import arrays
 import kpbench
 from kpbench.analysis import measures as analysis
 from kpbench.analysis import search
-from kpbench.analysis.cell_images import Grid, attitudes, images, seen_cells
+from kpbench.analysis.cell_images import BLUR, HALF, MARGIN, Grid, attitudes, images, seen_cells
+from kpbench.analysis.identity import correlation_and_distance, mirrored_distance, symmetry_order, turned_distance
+from kpbench.analysis.localisation import basin, disc_bound, tilt_bias
+from kpbench.analysis.measures import pixels_needed
+from kpbench.analysis.natural_images import natural_response, sample_windows
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import rasterise
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
@@ -95,7 +99,7 @@ def test_bound_equals_the_inverse_of_the_whole_information_matrix():
     J = np.array([(image(at + step * e) - image(at - step * e)) / (2 * step) for e in np.eye(8)])
     variance = np.linalg.inv(J @ J.T / 10**2)[:2, :2]
     grid = Grid.of([patch])
-    worst, rms = analysis.disc_bound(grid, grid.inks([patch]), radius)
+    worst, rms = disc_bound(grid, grid.inks([patch]), radius)
     assert worst[0] == pytest.approx(np.sqrt(np.linalg.eigvalsh(variance).max()), rel=0.01)
     assert rms[0] == pytest.approx(np.sqrt(np.trace(variance) / 2), rel=0.01)
 
@@ -103,31 +107,31 @@ def test_bound_equals_the_inverse_of_the_whole_information_matrix():
 @pytest.mark.parametrize(("radius", "low", "high"), [(5.0, 0.015, 0.04), (8.0, 0.012, 0.03), (45.0, 0.005, 0.012)])
 def test_bounds_have_the_known_magnitude(radius, low, high):
     names = ["checker", "trefoil", "wheel", "mushroom", "quarter", "half"]
-    worst, rms = measured(names, analysis.disc_bound, radius_px=radius)
+    worst, rms = measured(names, disc_bound, radius_px=radius)
     assert np.all((worst >= low) & (worst <= high))
     assert np.all(rms <= worst)
 
 
 def test_without_its_rim_a_single_edge_does_not_tell_the_centre():
-    with_rim = measured(["half", "checker"], analysis.disc_bound, radius_px=8.0)[0]
-    without = measured(["half", "checker"], analysis.disc_bound, radius_px=8.0, rim=False)[0]
+    with_rim = measured(["half", "checker"], disc_bound, radius_px=8.0)[0]
+    without = measured(["half", "checker"], disc_bound, radius_px=8.0, rim=False)[0]
     assert np.isinf(without[0])
     assert with_rim[1] < without[1] < 0.05
 
 
 def test_tilt_and_blur_cost_localisation():
     names = ["checker", "mushroom"]
-    frontal = measured(names, analysis.disc_bound, radius_px=8.0)[0]
-    assert np.all(measured(names, analysis.disc_bound, radius_px=8.0, tilt_deg=60.0)[0] > 1.4 * frontal)
-    assert np.all(measured(names, analysis.disc_bound, radius_px=8.0, blur=0.2)[0] > 1.4 * frontal)
+    frontal = measured(names, disc_bound, radius_px=8.0)[0]
+    assert np.all(measured(names, disc_bound, radius_px=8.0, tilt_deg=60.0)[0] > 1.4 * frontal)
+    assert np.all(measured(names, disc_bound, radius_px=8.0, blur=0.2)[0] > 1.4 * frontal)
 
 
 def test_basin_orders_designs_as_a_trained_network_did(monkeypatch):
     """Share of centres that a throw-away network put inside 10 %: 0.73, 0.67, 0.58, 0.28, 0.03."""
     monkeypatch.setattr(analysis, "SEEN_BASIN", (1.0,))  # sectors look the same at any scale
-    checker, three_quarter, quarter = measured(["checker", "three-quarter", "quarter"], analysis.basin)
+    checker, three_quarter, quarter = measured(["checker", "three-quarter", "quarter"], basin)
     monkeypatch.setattr(analysis, "SEEN_BASIN", (1 / 3,))  # where the other one is worst
-    flipped, half = measured(["flipped-half", "half"], analysis.basin)
+    flipped, half = measured(["flipped-half", "half"], basin)
     assert checker > 2 * quarter
     assert quarter == pytest.approx(three_quarter, rel=1e-3), "inks exchanged: the measure cannot tell them apart"
     assert quarter > 1.5 * flipped
@@ -135,18 +139,18 @@ def test_basin_orders_designs_as_a_trained_network_did(monkeypatch):
 
 
 def test_arcs_are_biased_under_tilt_and_crossings_are_not():
-    assert analysis.tilt_bias(NAMED["checker"]) == 0.0
+    assert tilt_bias(NAMED["checker"]) == 0.0
     radius, camera = 45.0, Camera(1624, 1240, 889.0)
     distance = camera.focal_px / radius
     near, far = (camera.focal_px * sign * 0.5 / (distance - sign * np.sqrt(0.75)) for sign in (1, -1))
-    assert analysis.tilt_bias(NAMED["half"], radius, 60.0) == pytest.approx(abs(near + far) / 2, rel=1e-6)
+    assert tilt_bias(NAMED["half"], radius, 60.0) == pytest.approx(abs(near + far) / 2, rel=1e-6)
 
 
 # --- Identity -----------------------------------------------------------------------------------------
 
 
 def test_distance_of_designs():
-    correlation, distance = measured(["checker", "three-quarter", "quarter"], analysis.correlation_and_distance)
+    correlation, distance = measured(["checker", "three-quarter", "quarter"], correlation_and_distance)
     np.testing.assert_allclose(correlation, correlation.T)
     np.testing.assert_allclose(np.diag(correlation), 1.0, atol=1e-5)
     np.testing.assert_allclose(np.diag(distance), 0.0, atol=2e-3)
@@ -156,12 +160,12 @@ def test_distance_of_designs():
 
 
 def test_the_shipped_designs_tell_their_orientation_but_for_the_checker():
-    assert [analysis.symmetry_order(p) for p in kpbench.shipped_patches()] == [2, 1, 1, 1]
-    assert analysis.symmetry_order(Patch("disc", 0, "black", ())) == 0
-    turned = measured(["checker", "wheel"], analysis.turned_distance)
+    assert [symmetry_order(p) for p in kpbench.shipped_patches()] == [2, 1, 1, 1]
+    assert symmetry_order(Patch("disc", 0, "black", ())) == 0
+    turned = measured(["checker", "wheel"], turned_distance)
     assert turned[0] == pytest.approx(0.0, abs=1e-3)
     assert turned[1] > 0.1
-    mirrored = measured(["checker", "trefoil", "wheel", "mushroom", "nested-halves"], analysis.mirrored_distance)
+    mirrored = measured(["checker", "trefoil", "wheel", "mushroom", "nested-halves"], mirrored_distance)
     np.testing.assert_allclose(mirrored[:4], 0.0, atol=1e-3)
     assert mirrored[4] > 0.1
 
@@ -171,7 +175,7 @@ def test_the_shipped_designs_tell_their_orientation_but_for_the_checker():
 
 def painted(patch, radius=5.0):
     """An image of a design, 13 + 8 px a side, black 40 and white 220."""
-    half = analysis.HALF + analysis.MARGIN
+    half = HALF + MARGIN
     grid = Grid.of([patch])
     cells = images(grid.cells(1e-3, 9.0), np.column_stack([radius * np.eye(2), (0, 0)])[None], half)[0]
     return (220 - 180 * grid.inks([patch])[0] @ cells).reshape(2 * half + 1, -1).round().astype(np.uint8)
@@ -180,23 +184,23 @@ def painted(patch, radius=5.0):
 def test_natural_response_finds_the_design_itself_and_no_flat_place():
     names = ["checker", "wheel"]
     windows = np.stack([painted(NAMED["checker"]), painted(NAMED["wheel"]), np.full((21, 21), 99, np.uint8)])
-    for blur in (0.0, analysis.BLUR):
-        response = measured(names, analysis.natural_response, windows=windows, blur=blur)
+    for blur in (0.0, BLUR):
+        response = measured(names, natural_response, windows=windows, blur=blur)
         np.testing.assert_allclose(response[:, 1], 1 / 3)
-    response = measured(names, analysis.natural_response, windows=windows[1:2])
+    response = measured(names, natural_response, windows=windows[1:2])
     np.testing.assert_array_equal(response[:, 1], [0, 1])
 
 
 def test_windows_come_from_the_images_and_are_repeatable():
     photographs = [np.full((60, 80), n, np.uint8) for n in (10, 20, 30)] + [np.full((5, 5), 40, np.uint8)]
-    windows = analysis.sample_windows(photographs, np.random.default_rng(1), 800)
+    windows = sample_windows(photographs, np.random.default_rng(1), 800)
     assert windows.shape == (800, 21, 21)
     np.testing.assert_array_equal(windows[:, 3, 4], np.repeat([10, 20, 30, 40], 200))
-    assert len(analysis.sample_windows(photographs, np.random.default_rng(1), 300)) == 300
+    assert len(sample_windows(photographs, np.random.default_rng(1), 300)) == 300
 
 
 def test_pixels_needed_of_a_quarter_and_a_half():
-    needed = measured(["half", "quarter"], analysis.pixels_needed)
+    needed = measured(["half", "quarter"], pixels_needed)
     corner = np.sin(np.pi / 4) / (1 + np.sin(np.pi / 4))  # inscribed circle of a quarter of the unit disc
     np.testing.assert_allclose(needed, [2.0, 1 / corner], rtol=0.03)
 

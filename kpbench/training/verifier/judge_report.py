@@ -21,7 +21,7 @@ from kpbench.types import Float
 
 FALSE_ALARM_RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 """False alarms per image."""
-THRESHOLDS = (0.3, 0.5)
+REPORTED_SCORES = (0.3, 0.5)
 """Scores, as probabilities."""
 
 
@@ -61,7 +61,7 @@ def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]
     alarms, found = np.cumsum(~right[order]) / len(parts), np.cumsum(right[order]) / truths
     last = np.maximum(np.searchsorted(alarms, FALSE_ALARM_RATES, side="right") - 1, 0)
     say(f"{name:27}" + "".join(f"{value:8.3f}" for value in found[last]))
-    for threshold in THRESHOLDS:
+    for threshold in REPORTED_SCORES:
         kept = log_odds >= np.log(threshold / (1 - threshold))
         say(
             f"    at {threshold}: detection {(right & kept).sum() / truths:.3f}, "
