@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from helpers import kpbench
 
-from kpbench.analysis import measures as analysis
+from kpbench.analysis.natural_images import sample_windows
 
 DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
 
@@ -15,7 +15,7 @@ def quick(monkeypatch):
     """Fewer sizes and windows: what is printed, not what is measured."""
     monkeypatch.setattr(analysis, "SIZES_PX", (5.0, 8.0))
     monkeypatch.setattr(analysis, "SEEN_BASIN", (1.0,))
-    monkeypatch.setattr(analysis.sample_windows, "__defaults__", (400,))
+    monkeypatch.setattr(sample_windows, "__defaults__", (400,))
 
 
 def test_table_json_and_figure(quick, tmp_path):
