@@ -33,6 +33,12 @@ class PredictionRun:
         A failed image has no detections.
     failures : tuple of (str, str)
         Name and message of each image that could not be read or on which the detector raised an error.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.predict(kpbench.open_dataset("kpbench-data"), "sift").predictions.detector["name"]
+    'sift'
     """
 
     predictions: Predictions
@@ -81,10 +87,9 @@ def predict(
     Examples
     --------
     >>> import kpbench
-    >>> dataset = kpbench.generate(kpbench.SynthConfig(2, seed=1, size_px=(160, 120)), "data", workers=1).dataset
-    >>> run = kpbench.predict(dataset, "template")
+    >>> run = kpbench.predict(kpbench.open_dataset("kpbench-data"), "sift")
     >>> len(run.predictions), run.failures
-    (2, ())
+    (6, ())
     """
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):

@@ -146,7 +146,15 @@ def identify(id_logits: Float32, xy: Float) -> Float:
 
 
 def keypoint_probability(detector_logits: Float32) -> Float32:
-    """Return the softmax of detector logits (65, h, w) over each cell as an image (8h, 8w); 0 in empty cells."""
+    """Return the softmax of detector logits (65, h, w) over each cell as an image (8h, 8w); 0 in empty cells.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.detectors import keypoint_probability
+    >>> keypoint_probability(np.zeros((65, 3, 4), np.float32)).shape
+    (24, 32)
+    """
     _, h, w = detector_logits.shape
     rows, columns = np.nonzero(detector_logits[:-1].max(axis=0) - detector_logits[-1] > EMPTY_CELL_LOG_ODDS)
     logits = detector_logits[:, rows, columns]
@@ -317,7 +325,14 @@ class SuperPointDetector:
 
 @dataclass
 class SmallSuperPointDetector(SuperPointDetector):
-    """:class:`SuperPointDetector` with the smaller network."""
+    """:class:`SuperPointDetector` with the smaller network, which takes a quarter of the time.
+
+    Examples
+    --------
+    >>> from kpbench.detectors import SmallSuperPointDetector
+    >>> SmallSuperPointDetector(verified=False).threshold is None
+    True
+    """
 
     shipped: ClassVar[str] = "superpoint-small"
 

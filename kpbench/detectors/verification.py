@@ -95,6 +95,16 @@ class VerifiedCandidates:
         Short semi-axis of the fitted disc, px.
     score : ndarray of shape (n,)
         Probability that there is a patch of this design whose centre is right.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.detectors import verify_candidates
+    >>> image, no_places = np.full((48, 64), 120, np.uint8), np.zeros((0, 2))
+    >>> found = verify_candidates(image, no_places, np.zeros(0), np.zeros((0, 5)), kpbench.shipped_patches())
+    >>> found.place, found.score
+    (array([], dtype=int64), array([], dtype=float64))
     """
 
     place: Int
@@ -122,6 +132,24 @@ def verify_candidates(
         The designs.
     threads : int
         Threads of the three networks; 0 means as many as OpenCV may use.
+
+    Returns
+    -------
+    VerifiedCandidates
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.detectors import verify_candidates
+    >>> patches = kpbench.shipped_patches()
+    >>> v, u = (np.mgrid[:96, :96] - 47.5) / 20.0
+    >>> black = patches[1].is_black(np.stack([u, v], axis=-1))
+    >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.uint8)
+    >>> log_id = np.log(np.full((1, len(patches) + 1), 0.2))
+    >>> found = verify_candidates(image, np.array([[48.0, 49.0]]), np.array([0.9]), log_id, patches)
+    >>> found.xy.round(1), patches[found.design[0]].name
+    (array([[47.5, 47.5]]), 'trefoil')
     """
     pyramids = Pyramids(grey)
     with one_blas_thread():

@@ -53,6 +53,17 @@ class Fit:
         Correlation of model and pixels over the disc, in [-1, 1].
     noise : ndarray of shape (N,)
         Standard deviation of the residuals, grey levels.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.fitting import build_pyramid
+    >>> levels = build_pyramid(np.full((48, 64), 120, np.uint8), 0)
+    >>> xy, A, patches = np.array([[30.0, 20.0]]), np.array([np.eye(2) * 12.0]), kpbench.shipped_patches()[:1]
+    >>> found = kpbench.fit(levels, xy, A, patches)
+    >>> found.ncc < 0.1
+    array([ True])
     """
 
     xy: Float

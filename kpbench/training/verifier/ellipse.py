@@ -146,6 +146,14 @@ def train_ellipse(
     ------
     DataError
         If a dataset cannot be read, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import kpbench
+    >>> from kpbench.training import train_ellipse
+    >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
+    >>> train_ellipse(sets, kpbench.open_dataset("set-3"), Path("ellipse"), say=print)  # doctest: +SKIP
     """
     prepare_training(out, threads)
     parts: list[Places] = []

@@ -68,54 +68,40 @@ def train_judges(
 
     Parameters
     ----------
-    datasets : sequence of Dataset
-        Synthetic images to train on.
-    test : Dataset
-        Synthetic images for the report: detection scores at several rates of false alarms.
-    out : Path
-        Folder for the files.
+    datasets, test, out, epochs, batch, from_shipped, workers, threads, say
+        As for :func:`kpbench.training.train_ellipse`. The report tells detection scores at several rates of false
+        alarms.
     detector : Path, optional
         Weights whose candidates are judged, written by ``kpbench export-model``. None: ``superpoint-small``.
-    epochs, batch : int
-        Passes over the hypotheses, and hypotheses per step.
-    from_shipped : bool
-        Start from the shipped weights; with ``epochs=0`` the report tells how good these are.
-    workers : int
-        Processes that collect hypotheses; 0: none but this one.
-    threads : int, optional
-        Threads of PyTorch.
-    say : callable
-        Receives the report, line by line.
 
     Raises
     ------
     DataError
         If a dataset or the detector cannot be read, or the folder cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import kpbench
+    >>> from kpbench.training import train_judges
+    >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
+    >>> train_judges(sets, kpbench.open_dataset("set-3"), Path("judges"), say=print)  # doctest: +SKIP
     """
     prepare_training(out, threads)
-    patches = load_places_detector(detector).patches
-    sets = [*datasets, test]
+    patches, sets = load_places_detector(detector).patches, [*datasets, test]
     looks = [
         map_images(partial(collect_looks, detector), part, repeat(part is not test, len(part)), workers, f"look {n}")
         for n, part in enumerate(sets)
     ]
-    first = _train_first([image for part in looks[:-1] for image in part], patches, epochs, batch, from_shipped, say)
+    settings = _Settings(patches, epochs, batch, from_shipped, say)
+    first = _train_first([image for part in looks[:-1] for image in part], settings)
     packed = pickle.dumps(first)
-    fits = [
-        map_images(
-            partial(collect_fits, detector, packed, part is not test),
-            part,
-            [image.first_look for image in of_part],
-            workers,
-            f"fit {n}",
-        )
-        for n, (part, of_part) in enumerate(zip(sets, looks, strict=True))
-    ]
+    fits = []
+    for n, (part, of_part) in enumerate(zip(sets, looks, strict=True)):
+        work = partial(collect_fits, detector, packed, part is not test)
+        fits.append(map_images(work, part, [image.first_look for image in of_part], workers, f"fit {n}"))
     truths = [image.keypoints for part in looks[:-1] for image in part]
-    fitted = [image.fitted for part in fits[:-1] for image in part]
-    unknown = np.zeros(sum(map(len, fitted)))
-    training = _label(fitted, patches, truths, unknown, FIT_TOLERANCE)
-    second = _train(training, patches, SECOND_WIDTH, epochs, batch, SECOND_JUDGE if from_shipped else None, say)
+    second = _train_second([image.fitted for part in fits[:-1] for image in part], truths, settings)
     report_judges(looks[-1], fits[-1], second, patches, say)
     for name, network, seen in (
         (FIRST_JUDGE, first, [image.first_look for image in looks[-1]]),
@@ -123,6 +109,17 @@ def train_judges(
     ):
         inputs = [input_tensors(hypotheses, patches) for hypotheses in seen if len(hypotheses)][:100]
         write_network(network, ["view", "evidence"], inputs, out / f"{name}.onnx", say)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """What the trainings of both judges share; the names are those of :func:`train_judges`."""
+
+    patches: Sequence[Patch]
+    epochs: int
+    batch: int
+    from_shipped: bool
+    say: Say
 
 
 @dataclass(frozen=True)
@@ -164,38 +161,30 @@ def _label(
     return LabelledHypotheses(Hypotheses.concatenate(hypotheses), right, near, shift, log_map, share)
 
 
-def _train_first(
-    looks: Sequence[ImageLooks],
-    patches: Sequence[Patch],
-    epochs: int,
-    batch: int,
-    from_shipped: bool,
-    say: Say,
-) -> Judge:
+def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
     """Train the first judge on the hypotheses of both looks."""
     hypotheses = [look for image in looks for look in (image.first_look, image.second_look)]
     truths = [image.keypoints for image in looks for _ in range(2)]
     known = np.concatenate([image.shipped_log_odds for image in looks])
-    training = _label(hypotheses, patches, truths, known, POSE_TOLERANCE)
-    return _train(training, patches, FIRST_WIDTH, epochs, batch, FIRST_JUDGE if from_shipped else None, say)
+    training = _label(hypotheses, settings.patches, truths, known, POSE_TOLERANCE)
+    return _train(training, FIRST_JUDGE, FIRST_WIDTH, settings)
 
 
-def _train(
-    training: LabelledHypotheses,
-    patches: Sequence[Patch],
-    width: int,
-    epochs: int,
-    batch: int,
-    shipped: str | None,
-    say: Say,
-) -> Judge:
-    """Train a judge, from the shipped weights of that name if any.
+def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], settings: _Settings) -> Judge:
+    """Train the second judge on fitted hypotheses, of which no earlier judge knew anything."""
+    unknown = np.zeros(sum(map(len, fitted)))
+    training = _label(fitted, settings.patches, truths, unknown, FIT_TOLERANCE)
+    return _train(training, SECOND_JUDGE, SECOND_WIDTH, settings)
+
+
+def _train(training: LabelledHypotheses, name: str, width: int, settings: _Settings) -> Judge:
+    """Train the judge of that name.
 
     Minimises the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
     """
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
-    whole, share = training.hypotheses, training.share
+    whole, share, patches = training.hypotheses, training.share, settings.patches
     target, near = torch.from_numpy(training.right).float(), torch.from_numpy(training.near)
     shift, log_map = torch.from_numpy(training.shift).float(), torch.from_numpy(training.log_map).float()
     weight = torch.from_numpy(1 / share).float()
@@ -205,8 +194,9 @@ def _train(
 
     some_evidence = whole.evidence[:: max(1, len(whole) // 100_000)]
     network = Judge(some_evidence, width).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    if shipped:
-        load_shipped(network, shipped, input_tensors(whole[rng.permutation(len(whole))[:BATCHNORM_SAMPLES]], patches))
+    if settings.from_shipped:
+        seen = whole[rng.permutation(len(whole))[:BATCHNORM_SAMPLES]]
+        load_shipped(network, name, input_tensors(seen, patches))
 
     def loss(rows: Tensor) -> Tensor:
         view, evidence = input_tensors(whole[rows.numpy()], patches)
@@ -217,9 +207,9 @@ def _train(
             value = value + nn.functional.smooth_l1_loss(predicted_map[taught], log_map[rows][taught], beta=0.05)
         return value
 
-    say(f"train on {len(share)} hypotheses, {training.right.mean():.0%} right, {share.sum():.0f} per epoch")
-    learning_rate = CONTINUED_LEARNING_RATE if shipped else LEARNING_RATE
-    train_one_cycle(network, loss, draw_rows, epochs, batch, learning_rate)
+    settings.say(f"train on {len(share)} hypotheses, {training.right.mean():.0%} right, {share.sum():.0f} per epoch")
+    learning_rate = CONTINUED_LEARNING_RATE if settings.from_shipped else LEARNING_RATE
+    train_one_cycle(network, loss, draw_rows, settings.epochs, settings.batch, learning_rate)
     return cast(Judge, network)
 
 
