@@ -20,7 +20,7 @@ from .fitting.design_fit import fit as fit
 from .patches.board import Board as Board
 from .patches.board import grid_board as grid_board
 from .patches.board import hexagon_board as hexagon_board
-from .patches.board import load_board as load_board
+from .patches.board_file import load_board as load_board
 from .patches.design import Patch as Patch
 from .patches.design import load_patches as load_patches
 from .patches.design import shipped_patches as shipped_patches

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from kpbench.errors import DesignError
 from kpbench.files import make_folder, write_atomic
-from kpbench.patches.board import DEFAULT_DIAMETER_MM, Board
+from kpbench.patches.board import Board
+from kpbench.patches.board_file import DEFAULT_DIAMETER_MM
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.printing.formats import PAGE_WRITERS
 from kpbench.printing.page_format import PageFormat, parse_page_format

@@ -1,0 +1,137 @@
+"""Boards as TOML files: a grid of designs, or a list of keypoints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from kpbench.errors import DesignError
+from kpbench.patches.board import Board, BoardKeypoint, grid_board
+from kpbench.patches.design import Patch, load_patches, shipped_patches
+from kpbench.toml import TomlTable, name_source, read_toml
+
+BOARD_FILE_SCHEMA = "kpbench.board-design/1"
+GRID_PITCH = 2.0  # distance of neighbours in a grid whose file names no pitch, in disc diameters
+DEFAULT_DIAMETER_MM = 30.0
+BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
+GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
+KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
+SIZE_MM = (0.1, 5000.0)  # least and greatest diameter or pitch in a file
+PLACE_MM = (-25_000.0, 25_000.0)  # least and greatest coordinate in a file
+
+
+def find_patch(patches: Sequence[Patch], key: object) -> Patch:
+    """Return the design with a name or an id.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    key : str or int
+        Name, or id as a number or as a text.
+
+    Raises
+    ------
+    DesignError
+        If no design has this name or id, or if two designs have this name.
+
+    Examples
+    --------
+    >>> from kpbench.patches import find_patch, shipped_patches
+    >>> find_patch(shipped_patches(), "wheel").patch_id
+    2
+    """
+    found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
+    if len(found) != 1:
+        known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
+        raise DesignError(f"patch {key!r} is {'carried by two designs' if found else 'not known'}; known are: {known}")
+    return found[0]
+
+
+def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
+    """Read a board from a TOML file with either a ``[grid]`` or a list of ``[[keypoint]]``.
+
+    Parameters
+    ----------
+    path : str or Path
+    patches : sequence of Patch, optional
+        Designs that the file may name. If left out: the designs that the file lists under ``designs`` (paths relative
+        to the file), or else the shipped designs.
+    diameter_mm : float, optional
+        Diameter of discs for which the file sets none; 30 if left out.
+
+    Raises
+    ------
+    DesignError
+        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. The message
+        names the file, the key and what was expected.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> import kpbench
+    >>> _ = Path("mine.toml").write_text("grid = { rows = 2, columns = 3 }")
+    >>> board = kpbench.load_board("mine.toml", diameter_mm=20.0)
+    >>> board.side_x_mm, board.side_y_mm
+    (120.0, 80.0)
+    """
+    path = Path(path)
+    content = read_toml(path, DesignError)
+    with name_source(path, DesignError):
+        return parse_board(content, path, patches, diameter_mm)
+
+
+def parse_board(
+    content: Mapping[str, Any], path: Path, patches: Sequence[Patch] | None, diameter_mm: float | None
+) -> Board:
+    """Return the board that the content of a TOML file describes, see :func:`load_board`."""
+    table = TomlTable(content, BOARD_KEYS, DesignError)
+    table.require_schema(BOARD_FILE_SCHEMA, optional=True)
+    if "designs" in table:
+        files = table.entries("designs", "a list of file names")
+        if not all(isinstance(file, str) for file in files):
+            raise table.problem("designs", "a list of file names")
+        if patches is not None:
+            raise DesignError("designs is set in the file, and others were given; drop one of them")
+        patches = load_patches([path.parent / file for file in files])
+    elif patches is None:
+        patches = shipped_patches()
+    name = table.text("name", path.stem)
+    if ("grid" in table) == ("keypoint" in table):
+        raise DesignError("expected either one [grid] or [[keypoint]] entries")
+    if "diameter_mm" in table and diameter_mm is not None:
+        raise DesignError(f"diameter_mm is set in the file, and {diameter_mm:g} was asked for; drop one of them")
+    diameter = table.number("diameter_mm", *SIZE_MM, DEFAULT_DIAMETER_MM if diameter_mm is None else diameter_mm)
+    if "grid" in table:
+        board = _parse_grid(table.table("grid", GRID_KEYS), patches, diameter, name)
+        keypoints, size = board.keypoints, (board.side_x_mm, board.side_y_mm)
+    else:
+        keypoints = tuple(_parse_keypoint(t, patches, diameter) for t in table.tables("keypoint", KEYPOINT_KEYS))
+        size = (
+            2 * max((abs(k.x_mm) + k.extent_mm for k in keypoints), default=0.0),
+            2 * max((abs(k.y_mm) + k.extent_mm for k in keypoints), default=0.0),
+        )
+    if "size_mm" in table:
+        width, height = table.numbers("size_mm", 1.0, 50_000.0, 2)
+        size = (width, height)
+    return Board(name, *size, keypoints)
+
+
+def _parse_grid(table: TomlTable, patches: Sequence[Patch], diameter_mm: float, name: str) -> Board:
+    rows, columns = (table.whole_number(key, 1, 100) for key in ("rows", "columns"))
+    pitch_mm = table.number("pitch_mm", *SIZE_MM, GRID_PITCH * diameter_mm)
+    if "patches" in table:
+        patches = [find_patch(patches, key) for key in table.entries("patches", "a list of names or ids")]
+    return grid_board(patches, rows, columns, diameter_mm, pitch_mm, name)
+
+
+def _parse_keypoint(table: TomlTable, patches: Sequence[Patch], diameter_mm: float) -> BoardKeypoint:
+    with name_source(table.place, DesignError):
+        patch = find_patch(patches, table.values.get("patch"))
+    return BoardKeypoint(
+        patch,
+        table.number("x_mm", *PLACE_MM),
+        table.number("y_mm", *PLACE_MM),
+        table.number("rotate_deg", -360.0, 360.0, 0.0),
+        table.number("diameter_mm", *SIZE_MM, diameter_mm),
+    )
