@@ -97,8 +97,7 @@ def render_patches(
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.patches.board import find_patch
-    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM
+    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
@@ -142,8 +141,8 @@ def _check_usage(given: set[str], board: str | None) -> None:
 def _boards(name: str, patches: Sequence[Patch], own: bool, diameter_mm: float | None) -> list[Board]:
     """Make the boards that --board asks for: hexagons of one design each, one grid, or the board of a file."""
     from kpbench.errors import DesignError
-    from kpbench.patches.board import GRID_PITCH, HEXAGON_DIAMETER, grid_board, hexagon_board
-    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, load_board
+    from kpbench.patches.board import HEXAGON_DIAMETER, grid_board, hexagon_board
+    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, GRID_PITCH, load_board
 
     diameter = diameter_mm or DEFAULT_DIAMETER_MM
     if name == "hexagon":

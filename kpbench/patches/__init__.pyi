@@ -2,9 +2,9 @@ from .board import Board as Board
 from .board import BoardKeypoint as BoardKeypoint
 from .board import BoardLike as BoardLike
 from .board import BoardPoint as BoardPoint
-from .board import find_patch as find_patch
 from .board import grid_board as grid_board
 from .board import hexagon_board as hexagon_board
+from .board_file import find_patch as find_patch
 from .board_file import load_board as load_board
 from .design import Patch as Patch
 from .design import SemiCircle as SemiCircle

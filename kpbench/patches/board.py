@@ -1,4 +1,4 @@
-"""Boards: patches at known places in mm. A board is a hexagon, a grid, or the content of a TOML file.
+"""Boards: patches at known places in mm, in particular hexagons and grids.
 
 Board frame: mm, x right, y down, z away from the viewer. The origin is the board's centre. ``cv2.solvePnP`` takes
 ``Board.points_mm`` without conversion.
@@ -21,7 +21,6 @@ from kpbench.types import Float
 
 HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side: the paper's 16-px patch on 0.5 % of the image
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
-GRID_PITCH = 2.0  # distance of neighbours in a grid whose file names no pitch, in disc diameters
 TOUCHING_MM = 1e-6  # patches may overlap by this much, so that rounding does not part patches that touch
 
 
@@ -293,30 +292,3 @@ def grid_board(
         for column in range(columns)
     )
     return Board(name, columns * pitch_mm, rows * pitch_mm, keypoints)
-
-
-def find_patch(patches: Sequence[Patch], key: object) -> Patch:
-    """Return the design with a name or an id.
-
-    Parameters
-    ----------
-    patches : sequence of Patch
-    key : str or int
-        Name, or id as a number or as a text.
-
-    Raises
-    ------
-    DesignError
-        If no design has this name or id, or if two designs have this name.
-
-    Examples
-    --------
-    >>> from kpbench.patches import find_patch, shipped_patches
-    >>> find_patch(shipped_patches(), "wheel").patch_id
-    2
-    """
-    found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
-    if len(found) != 1:
-        known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
-        raise DesignError(f"patch {key!r} is {'carried by two designs' if found else 'not known'}; known are: {known}")
-    return found[0]

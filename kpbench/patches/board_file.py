@@ -1,4 +1,4 @@
-"""Boards as TOML files: which patch lies where."""
+"""Boards as TOML files: a grid of designs, or a list of keypoints."""
 
 from __future__ import annotations
 
@@ -7,29 +7,45 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.errors import DesignError
-from kpbench.patches.board import GRID_PITCH, Board, BoardKeypoint, find_patch, grid_board
+from kpbench.patches.board import Board, BoardKeypoint, grid_board
 from kpbench.patches.design import Patch, load_patches, shipped_patches
 from kpbench.toml import TomlTable, name_source, read_toml
 
-TOML_SCHEMA = "kpbench.board-design/1"
-
-
+BOARD_FILE_SCHEMA = "kpbench.board-design/1"
+GRID_PITCH = 2.0  # distance of neighbours in a grid whose file names no pitch, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
-
-
 BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
-
-
 GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
-
-
 KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
-
-
 SIZE_MM = (0.1, 5000.0)  # least and greatest diameter or pitch in a file
-
-
 PLACE_MM = (-25_000.0, 25_000.0)  # least and greatest coordinate in a file
+
+
+def find_patch(patches: Sequence[Patch], key: object) -> Patch:
+    """Return the design with a name or an id.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    key : str or int
+        Name, or id as a number or as a text.
+
+    Raises
+    ------
+    DesignError
+        If no design has this name or id, or if two designs have this name.
+
+    Examples
+    --------
+    >>> from kpbench.patches import find_patch, shipped_patches
+    >>> find_patch(shipped_patches(), "wheel").patch_id
+    2
+    """
+    found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
+    if len(found) != 1:
+        known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
+        raise DesignError(f"patch {key!r} is {'carried by two designs' if found else 'not known'}; known are: {known}")
+    return found[0]
 
 
 def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
@@ -70,7 +86,7 @@ def parse_board(
 ) -> Board:
     """Return the board that the content of a TOML file describes, see :func:`load_board`."""
     table = TomlTable(content, BOARD_KEYS, DesignError)
-    table.require_schema(TOML_SCHEMA, optional=True)
+    table.require_schema(BOARD_FILE_SCHEMA, optional=True)
     if "designs" in table:
         files = table.entries("designs", "a list of file names")
         if not all(isinstance(file, str) for file in files):

@@ -9,7 +9,7 @@ from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
 from kpbench.files import shipped_folder
 from kpbench.geometry.camera import Camera
-from kpbench.patches.board import find_patch
+from kpbench.patches.board_file import find_patch
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.toml import TomlTable, name_source, read_toml
 

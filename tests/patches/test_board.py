@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from kpbench.errors import DesignError
 from kpbench.geometry.homography import project
-from kpbench.patches.board import Board, BoardKeypoint, find_patch, grid_board, hexagon_board
-from kpbench.patches.board_file import load_board
+from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
+from kpbench.patches.board_file import find_patch, load_board
 from kpbench.patches.design import parse_patch, shipped_patches
 
 PATCHES = shipped_patches()
