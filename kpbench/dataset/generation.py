@@ -271,6 +271,7 @@ class _Run:
 def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str, FinishedShard]:
     """Make the planned shards that are not kept; return all planned shards by their file names."""
     missing = [shard for shard in run.plan if shard.file not in kept]
+    # shards of the same scenes follow each other, so that cached backgrounds are used again
     missing.sort(key=lambda shard: run.config.scene_id(shard.first))
     _check_space(run.folder, run.config.image_bytes, sum(shard.count for shard in missing))
     run.progress(sum(shard.entry.count for shard in kept.values()))
