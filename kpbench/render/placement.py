@@ -16,7 +16,7 @@ from kpbench.types import Float
 GAP_PX = 2.0
 """Smallest distance between two patches of a random scene, px."""
 PLACEMENT_ROUNDS = 25
-"""How often free places are searched for, until a random scene has all its patches; mostly one round is enough."""
+"""Most rounds of the search for free places in a random scene; one round is mostly enough."""
 LARGEST_DEPTH_CHANGE = 0.5
 """Largest change of depth from a disc's centre to its rim, relative to the depth of the centre."""
 
@@ -128,7 +128,7 @@ def random_placements(
 ) -> list[Placement]:
     """Draw patches that keep the limits, do not overlap, and have their centres inside the image.
 
-    A camera of its own focal length sees each patch.
+    Each patch is seen by its own camera, with its own focal length.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def random_placements(
     Returns
     -------
     list of Placement
-        Fewer than were drawn where the image is too full for one more.
+        One per patch; fewer than the drawn number of patches if the image is too full.
 
     Examples
     --------
