@@ -66,10 +66,16 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     Examples:
       kpbench preview kpbench-data --count 20 --columns 5
     """
-    from kpbench.dataset.card import write_overview
+    from kpbench.dataset.card import draw_overview
     from kpbench.dataset.folder import open_dataset
+    from kpbench.files import write_atomic
+    from kpbench.images import encode_png
 
-    click.echo(write_overview(open_dataset(dataset), out, count, columns, tile_width))
+    data = open_dataset(dataset)
+    sheet = draw_overview(data, count, columns, tile_width)
+    target = out or data.path / "preview.png"
+    write_atomic(target, encode_png(sheet))
+    click.echo(str(target))
 
 
 @click.command()
@@ -92,4 +98,4 @@ def export(dataset: Path, file_format: str, out: Path | None) -> None:
 
     data = open_dataset(dataset)
     with progress_bar(len(data), "export") as progress:
-        click.echo(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress))
+        click.echo(str(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress)))

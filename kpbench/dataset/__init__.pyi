@@ -2,7 +2,6 @@ from .card import Histogram as Histogram
 from .card import dataset_facts as dataset_facts
 from .card import dataset_histograms as dataset_histograms
 from .card import draw_overview as draw_overview
-from .card import write_overview as write_overview
 from .config import DatasetConfig as DatasetConfig
 from .drawing import draw_detections as draw_detections
 from .drawing import draw_keypoints as draw_keypoints

@@ -11,12 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
-from kpbench.files import folder_at, write_atomic
+from kpbench.files import write_atomic
 from kpbench.images import encode_png
 from kpbench.types import Float, UInt8
 
-CARD, PREVIEW = "README.md", "preview.png"
-CARD_FILES = (CARD, PREVIEW)
+CARD_FILES = ("README.md", "preview.png")
 """The files that :func:`write_card` writes: the card and its picture."""
 SIZE_CATEGORIES = (
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
@@ -164,41 +163,6 @@ def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int
     return contact_sheet([draw_keypoints(*dataset[n], scale) for n in chosen], min(columns, len(chosen)))
 
 
-def write_overview(
-    dataset: Dataset, file: str | Path | None = None, count: int = 12, columns: int = 4, tile_width_px: int = 480
-) -> Path:
-    """Write the contact sheet of :func:`draw_overview` as a PNG file.
-
-    Parameters
-    ----------
-    dataset : Dataset
-    file : str or Path, optional
-        Default: ``preview.png`` in the folder of the dataset.
-    count, columns, tile_width_px : int
-        As for :func:`draw_overview`.
-
-    Returns
-    -------
-    Path
-        The file that was written.
-
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> dataset = kpbench.open_dataset("kpbench-data")
-    >>> kpbench.dataset.write_overview(dataset, "sheet.png", count=4, columns=2, tile_width_px=160).name
-    'sheet.png'
-    """
-    target = folder_at(dataset.path / PREVIEW if file is None else file)
-    write_atomic(target, encode_png(draw_overview(dataset, count, columns, tile_width_px)))
-    return target
-
-
 def write_card(dataset: Dataset, folder: Path) -> None:
     """Write the dataset card into a folder: ``README.md``, with the header that dataset hubs read, and its picture.
 
@@ -207,7 +171,8 @@ def write_card(dataset: Dataset, folder: Path) -> None:
     DataError
         If a file cannot be written.
     """
-    write_overview(dataset, folder / PREVIEW, tile_width_px=320)
+    card, picture = CARD_FILES
+    write_atomic(folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320)))
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
     facts = "\n".join(f"| {key} | {value} |" for key, value in dataset_facts(dataset).items())
     versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())
@@ -239,7 +204,7 @@ image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
 
 Made with {versions}.
 """
-    write_atomic(folder / CARD, text.encode(errors="backslashreplace"))
+    write_atomic(folder / card, text.encode(errors="backslashreplace"))
 
 
 def _markdown_table(histogram: Histogram) -> str:

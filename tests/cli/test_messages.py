@@ -1,6 +1,5 @@
 import re
 
-import albumentations
 import pytest
 from helpers import command, kpbench
 
@@ -51,8 +50,6 @@ def workplace(here, dataset):
     (here / "part").mkdir()
     (here / "part" / "shard-00000.h5").write_bytes((dataset.path / "shard-00000.h5").read_bytes())
     (here / "empty").mkdir()
-    flip = albumentations.Compose([albumentations.HorizontalFlip(p=1)])
-    albumentations.save(flip, "flip.json")
     return here
 
 
@@ -78,8 +75,6 @@ def workplace(here, dataset):
         (["score", "all.json"], "--gt"),
         (["score", "all.json", "--gt", "DATASET", "--pose"], "--pose"),
         (["compare", "few.json", "all.json", "--gt", "DATASET"], "--allow-missing"),
-        (["merge", "empty"], "PARTS"),
-        (["synth", "--n", 1, "--distractors", 2, "--augment", "flip.json"], "--augment: mirrors"),
         (["export", "DATASET", "--format", "coco", "--out", "part"], "--out"),
     ],
 )

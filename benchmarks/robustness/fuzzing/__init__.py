@@ -1,0 +1,1 @@
+"""Parts of ``fuzz.py``: valid files, what is changed in them, plain reference parsers, supervised workers."""
