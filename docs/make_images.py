@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 import kpbench
 from kpbench.cli import main as command_line
@@ -24,8 +24,8 @@ IMAGES = Path(__file__).parent / "images"
 PATCH_PX, MARGIN_PX, LABEL_PX = 160, 24, 36
 SAMPLES = 8
 """Samples per pixel and axis of the drawn patches."""
-LEVEL_STEP = 8
-"""Grey levels between the levels of a saved picture: a third of the size, and hardly to be seen."""
+GREY_STEP, COLOUR_STEP = 4, 32
+"""Levels between the levels of a saved picture, of grey pixels and of coloured ones: at most 256 colours in all."""
 README_SCENE = 19
 """The first scene of seed 0 that holds all four designs."""
 BOARD_IMAGE = 13
@@ -59,9 +59,10 @@ def draw_patches() -> Image.Image:
 
 
 def save(name: str, source: Image.Image | str) -> None:
-    """Write a picture, or a picture file again, with few levels."""
-    image = np.asarray((source if isinstance(source, Image.Image) else Image.open(source)).convert("RGB"))
-    few = np.minimum((image.astype(int) + LEVEL_STEP // 2) // LEVEL_STEP * LEVEL_STEP, 255).astype(np.uint8)
+    """Write a picture, or a picture file again, with few levels: a third of the size."""
+    image = np.asarray((source if isinstance(source, Image.Image) else Image.open(source)).convert("RGB")).astype(int)
+    step = np.where(np.ptp(image, axis=2, keepdims=True) < GREY_STEP, GREY_STEP, COLOUR_STEP)
+    few = np.minimum((image + step // 2) // step * step, 255).astype(np.uint8)
     Image.fromarray(few).quantize(256, dither=Image.Dither.NONE).save(IMAGES / f"{name}.png", optimize=True)
 
 
@@ -71,7 +72,7 @@ def main() -> None:
     save("patches", draw_patches())
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         kpbench_command("kpbench render-patches --board hexagon --patch trefoil --png --dpi 60")
-        save("page", "patches-print/hexagon-trefoil.png")
+        save("page", ImageOps.expand(Image.open("patches-print/hexagon-trefoil.png"), border=1, fill=160))
 
         kpbench_command("kpbench synth --n 20 --deteriorate none")
         kpbench_command("kpbench detect kpbench-data --detector superpoint-small --overlay found")

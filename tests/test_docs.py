@@ -8,6 +8,7 @@ that names ``kpbench-data`` or ``preds.json`` finds what ``example_data`` makes.
 
 import contextlib
 import doctest
+import importlib
 import importlib.util
 import inspect
 import io
@@ -91,6 +92,18 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, example_data):
             Path(name[1]).write_text(code)
         else:
             run_shell(re.sub(r"--n \d{3,}", "--n 6", code))  # big numbers of images are made small
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_id)
+def test_a_page_uses_public_names_alone(page):
+    text = page.read_text()
+    for module, names in re.findall(r"^ *from (kpbench[\w.]*) import ([^#\n]+)", text, re.MULTILINE):
+        assert module.count(".") < 2, f"from {module} import {names}"
+        public = importlib.import_module(module).__all__
+        assert {name.strip() for name in names.split(",")} <= set(public), f"from {module} import {names}"
+    for path in re.findall(r"\bkpbench((?:\.[a-z_]+)+)\(", text):
+        *rooms, name = path[1:].split(".")
+        assert name in importlib.import_module(".".join(["kpbench", *rooms])).__all__, f"kpbench{path}"
 
 
 def run_shell(code):
