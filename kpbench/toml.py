@@ -39,7 +39,10 @@ def name_source(source: str | Path, error: type[KpbenchError]) -> Iterator[None]
 
 @dataclass(frozen=True)
 class TomlTable:
-    """A table whose keys are known; each method returns the checked value of one key.
+    """A table whose keys are known.
+
+    A method returns the checked value of a key. If the table lacks the key, the method returns the default. Without a
+    default, it raises an error.
 
     Attributes
     ----------
@@ -48,8 +51,7 @@ class TomlTable:
     known : collection of str
         All keys that the table may have.
     error : type of KpbenchError
-        Raised with one line for an unknown key or a wrong value. The line does not name the file:
-        see :func:`name_source`.
+        Raised for an unknown key or a wrong value. The message does not name the file, see :func:`name_source`.
     place : str
         Name of the table within the file, such as ``keypoint[3]``; "" for the file itself.
     """
@@ -76,12 +78,12 @@ class TomlTable:
         return f"{self.place}.{key}" if self.place else key
 
     def problem(self, key: str, expected: str) -> KpbenchError:
-        """Return the error that the value of a key deserves, for the caller to raise."""
+        """Return the error for the wrong value of a key. The caller raises the error."""
         value = repr(self.values[key]) if key in self.values else "missing"
         return self.error(f"{self.path(key)} is {value}, expected {expected}")
 
     def require_schema(self, schema: str, optional: bool = False) -> None:
-        """Raise an error unless the key ``schema`` holds this text, or is absent and ``optional``."""
+        """Raise an error unless the key ``schema`` holds this text. An optional key may be missing."""
         if self.values.get("schema", schema if optional else None) != schema:
             raise self.problem("schema", repr(schema))
 
@@ -117,14 +119,14 @@ class TomlTable:
     def numbers(
         self, key: str, low: float, high: float = math.inf, count: int | None = None, whole: bool = False
     ) -> tuple[float, ...]:
-        """Return a list of numbers from ``low`` to ``high``, ``count`` of them or any number of them."""
+        """Return a list of numbers from ``low`` to ``high``; ``count`` is the length of the list, None for any."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple) or count not in (None, len(value)):
             raise self.problem(key, f"a list of {'' if count is None else f'{count} '}numbers")
         return tuple(self._number(f"{key}[{n}]", entry, low, high, whole) for n, entry in enumerate(value))
 
     def span(self, key: str, low: float, high: float) -> tuple[float, float]:
-        """Return (least, most) of ``[least, most]``, or of one number that is both."""
+        """Return (least, most). The file holds ``[least, most]``, or one number that stands for both."""
         if not isinstance(self.values.get(key), list):
             value = self.number(key, low, high)
             return value, value
@@ -134,18 +136,18 @@ class TomlTable:
         return least, most
 
     def entries(self, key: str, expected: str) -> list[Any]:
-        """Return a list that is not empty, whatever its entries are."""
+        """Return a list that is not empty. Its entries are not checked."""
         value = self.values.get(key)
         if not isinstance(value, list) or not value:
             raise self.problem(key, expected)
         return value
 
     def table(self, key: str, known: Collection[str], default: Mapping[str, Any] | None = None) -> TomlTable:
-        """Return a table within this one."""
+        """Return the table under a key."""
         return TomlTable(self.values.get(key, default), known, self.error, self.path(key))
 
     def tables(self, key: str, known: Collection[str]) -> list[TomlTable]:
-        """Return a list of tables within this one."""
+        """Return the list of tables under a key."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple):
             raise self.problem(key, f"a list of tables with: {', '.join(known)}")

@@ -13,13 +13,24 @@ import cv2
 import numpy as np
 
 from kpbench import shipped_patches
-from kpbench.analysis import search
-from kpbench.analysis.cell_images import Grid, attitudes
-from kpbench.analysis.identity import correlation_and_distance
-from kpbench.analysis.localisation import basin, bound, disc_bound
-from kpbench.analysis.measures import SIZES_PX, pixels_needed
-from kpbench.analysis.natural_images import natural_response, sample_windows
-from kpbench.render import procedural_background
+from kpbench.analysis import (
+    FAMILY_GRID,
+    SIZES_PX,
+    PolarGrid,
+    attitudes,
+    background_windows,
+    basin,
+    best_sets,
+    code_of,
+    correlation_and_distance,
+    design_bound,
+    enumerate_family,
+    inks_of,
+    natural_response,
+    pixels_needed,
+    point_bound,
+    search_designs,
+)
 
 HERE = Path(__file__).parents[1] / "designs"
 
@@ -36,20 +47,20 @@ def tag_corner(dictionary, radius_px, tilt_deg):
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - 1.0  # the black border's corner is the origin
     cells = [square + np.array([column, row]) for row, column in np.ndindex(modules.shape)]
     inks = modules.reshape(1, -1).astype(np.float32)
-    return max(bound(cells, inks, side * view)[0][0] for view in attitudes(1, (tilt_deg,)))
+    return max(point_bound(cells, inks, side * view)[0][0] for view in attitudes(1, (tilt_deg,)))
 
 
 def bounds_table():
     print("Bound in px, worst direction: frontal, then 60 degrees")
-    grid = Grid.of(shipped_patches())
+    grid = PolarGrid.of(shipped_patches())
     worst = {
-        tilt: [disc_bound(grid, grid.inks(shipped_patches()), r, tilt)[0] for r in SIZES_PX] for tilt in (0.0, 60.0)
+        tilt: [design_bound(grid, grid.inks(shipped_patches()), r, tilt)[0] for r in SIZES_PX] for tilt in (0.0, 60.0)
     }
     for n, patch in enumerate(shipped_patches()):
         print(f"{patch.name:24}", *(f"{worst[tilt][k][n]:.4f}" for tilt in worst for k in range(len(SIZES_PX))))
-    family, inks = search.FAMILY_GRID, list(crossings())[1]
-    medians = [np.median(disc_bound(family, inks, r, tilt)[0]) for tilt in worst for r in SIZES_PX]
-    no_rim = np.median(disc_bound(family, inks, SIZES_PX[0], rim=False)[0])
+    family, inks = FAMILY_GRID, list(crossings())[1]
+    medians = [np.median(design_bound(family, inks, r, tilt)[0]) for tilt in worst for r in SIZES_PX]
+    no_rim = np.median(design_bound(family, inks, SIZES_PX[0], rim=False)[0])
     print(f"{'family median':24}", *(f"{m:.4f}" for m in medians), f"and without the rim at 5 px {no_rim:.4f}")
     for name, tag in (("AprilTag 36h11 corner", "DICT_APRILTAG_36h11"), ("ArUco 4x4 corner", "DICT_4X4_50")):
         print(
@@ -59,8 +70,8 @@ def bounds_table():
 
 def crossings():
     """Codes and inks of the family's designs whose centre is a crossing."""
-    codes = search.enumerate_family().classes
-    inks = search.inks_of(codes)
+    codes = enumerate_family().classes
+    inks = inks_of(codes)
     edges = inks[:, :8] != np.roll(inks[:, :8], 1, axis=1)
     return (a[(edges[:, :4] | edges[:, 4:]).sum(1) >= 2] for a in (codes, inks))
 
@@ -68,7 +79,7 @@ def crossings():
 def family_measures(windows):
     """Codes and measures of all designs that some limit below lets through."""
     codes, inks = crossings()
-    grid = search.FAMILY_GRID
+    grid = FAMILY_GRID
     pixels = pixels_needed(grid, inks)
     codes, inks, pixels = (a[pixels <= 5] for a in (codes, inks, pixels))
     bound_to_centre = basin(grid, inks)
@@ -83,7 +94,7 @@ def family_measures(windows):
 def limits_table(windows):
     print("\nBest set under other limits (needs px, basin, natural, natural blurred): closest two, set")
     codes, pixels, bound_to_centre, natural, blurred, distance = family_measures(windows)
-    names = {search.code_of(p): p.name for p in shipped_patches()}
+    names = {code_of(p): p.name for p in shipped_patches()}
     limits = [(4.0, 0.10, 1 / 500, 1.0)]
     limits += [(p, 0.10, 1 / 500, 1.0) for p in (3.7, 4.5, 5.0)]
     limits += [(4.0, b, 1 / 500, 1.0) for b in (0.06, 0.08, 0.09, 0.11, 0.12)]
@@ -93,7 +104,7 @@ def limits_table(windows):
         chosen = np.flatnonzero(
             (pixels <= limit[0]) & (bound_to_centre >= limit[1]) & (natural <= limit[2]) & (blurred <= limit[3])
         )
-        sets = search.best_sets(distance[np.ix_(chosen, chosen)], 4, 1)
+        sets = best_sets(distance[np.ix_(chosen, chosen)], 4, 1)
         if not sets:
             print(*(f"{v:.4g}" for v in limit), "none")
             continue
@@ -107,7 +118,7 @@ def limits_table(windows):
 
 
 def write_runner_up(windows):
-    found = search.search(windows, shipped_patches())
+    found = search_designs(windows, shipped_patches())
     folder = HERE / "runner-up"
     for old in folder.glob("*.toml"):
         old.unlink()
@@ -123,8 +134,7 @@ def write_runner_up(windows):
 
 
 if __name__ == "__main__":
-    rng = np.random.default_rng(0)
-    nature = sample_windows((procedural_background(rng, 640, 480) for _ in range(100)), rng)
+    nature = background_windows()
     bounds_table()
     limits_table(nature)
     write_runner_up(nature)

@@ -1,4 +1,15 @@
-"""Measures of designs: how well they are located, told apart, and told from natural images."""
+"""Measures of designs: how well they are located, told apart, and told from natural images; the search for the best.
+
+Examples
+--------
+>>> import kpbench
+>>> from kpbench.analysis import PolarGrid, correlation_and_distance
+>>> patches = kpbench.shipped_patches()
+>>> grid = PolarGrid.of(patches)
+>>> correlation, distance = correlation_and_distance(grid, grid.inks(patches))
+>>> distance.shape
+(4, 4)
+"""
 
 import lazy_loader
 

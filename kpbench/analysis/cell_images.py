@@ -1,19 +1,18 @@
-"""Images of designs as products of two matrices: their inks, and the images of the cells they consist of.
+"""Images of designs as matrix products: the inks of a design times the images of its cells.
 
-A design is a polar chequer, so its image is *linear* in its inks: the image of every cell is rendered
-once for each attitude (exact area coverage), and a design's image, its derivatives and its correlations
-with other designs are matrix products with its vector of inks. That is what makes it cheap to measure a
-whole family of designs.
+A design is a polar chequer. Its image is therefore *linear* in its inks. Every cell is rendered once per attitude, with
+exact area coverage. The image of a design, its derivatives and its correlations with other designs are then products of
+matrices with the vector of its inks. A whole family of designs can be measured in this way.
 
 Conventions
 -----------
-* Inks are 1 for black and 0 for white.
-* An *attitude* is a 2x2 matrix from the unit disc to px: a rotation and a foreshortening. Perspective
-  within one patch is left out, a patch is small.
-* What is *seen* is always a disc of :data:`SEEN_PX` radius about the keypoint. If that is a fraction
-  ``seen`` of the patch, the patch is so much larger, and only its inner part is looked at. Beyond the
-  disc the outermost ring goes on, so that no difference is owed to a background.
-* Blur is Gaussian, its standard deviation a fraction of the seen radius.
+* An ink is 1 for black and 0 for white.
+* An *attitude* is a 2x2 matrix from the unit disc to px: a rotation and a foreshortening. A patch is small, and
+  perspective within the patch is left out.
+* The *window* is a disc of :data:`WINDOW_PX` radius about the keypoint. Only windows are compared. A window that shows
+  the fraction ``seen`` of the patch's radius stands for a patch of ``WINDOW_PX / seen`` radius.
+* The outermost ring continues outside the patch. Differences between designs therefore never come from a background.
+* Blur is Gaussian. Its standard deviation is given as a fraction of the window's radius.
 """
 
 from __future__ import annotations
@@ -30,17 +29,17 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
 TILTS_DEG = (0.0, 30.0, 60.0)
-DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # of the tilt, in the image
+TILT_DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # directions in the image along which a tilted patch is foreshortened
 TURNS = 24  # rotations in the plane that are compared, 15 degrees apart
-SEEN_PX = 5.0
-BLUR = 0.2
-HALF = int(SEEN_PX) + 1  # of a window, px
-MARGIN = int(np.ceil(4 * BLUR * SEEN_PX))  # around it, for the blur
+WINDOW_PX = 5.0  # radius of the window
+BLUR = 0.2  # standard deviation, as a fraction of the window's radius
+HALF_SIDE_PX = int(WINDOW_PX) + 1  # half the side of the square around the window
+BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # around the square, for the blur
 
 
 @dataclass(frozen=True)
-class Grid:
-    """A polar chequer that several designs fit on.
+class PolarGrid:
+    """Rings and sectors of a polar chequer on which several designs fit.
 
     Attributes
     ----------
@@ -48,14 +47,24 @@ class Grid:
         Outer radii of the rings, ascending, in disc radii.
     angles_deg : tuple of float
         Borders of the sectors, ascending, in [0, 360).
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import PolarGrid
+    >>> grid = PolarGrid.of(kpbench.shipped_patches())
+    >>> grid.shape
+    (2, 8)
+    >>> grid.inks(kpbench.shipped_patches()).shape
+    (4, 16)
     """
 
     radii: tuple[float, ...]
     angles_deg: tuple[float, ...]
 
     @classmethod
-    def of(cls, patches: Sequence[Patch]) -> Grid:
-        """The coarsest grid on which all the designs and their mirror images fit."""
+    def of(cls, patches: Sequence[Patch]) -> PolarGrid:
+        """Return the coarsest grid on which all the designs and their mirror images fit."""
         radii = np.unique(np.round(np.concatenate([p.cells[0][1:] for p in patches]), 9))
         angles = np.concatenate([p.cells[1] for p in patches])
         angles = np.unique(np.round(np.append(angles, -angles) % 360.0, 9) % 360.0)
@@ -63,35 +72,46 @@ class Grid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rings, sectors."""
+        """Number of rings and number of sectors."""
         return len(self.radii), len(self.angles_deg)
 
     def middles(self) -> tuple[Float, Float]:
-        """Middle radii of the rings, middle angles of the sectors in degrees."""
+        """Return the middle radii of the rings, and the middle angles of the sectors in degrees."""
         radii, angles = np.append(0.0, self.radii), np.array(self.angles_deg)
         return (radii[1:] + radii[:-1]) / 2, (angles + np.append(angles[1:], angles[0] + 360.0)) / 2
 
     def inks(self, patches: Sequence[Patch]) -> Float32:
-        """Inks of the designs, shape (n, cells), ring by ring; a patch that ends early keeps its outer ring's inks."""
+        """Return the inks of designs, shape (n, cells), ring by ring.
+
+        A patch that is smaller than the grid continues with the inks of its outermost ring.
+        """
         radius, angle = self.middles()
         rows = []
         for patch in patches:
-            at = np.minimum(radius, patch.extent - 1e-6)[:, None, None]
-            turned = np.radians(angle)[None, :, None]
-            rows.append(patch.is_black(np.concatenate([at * np.cos(turned), at * np.sin(turned)], -1)).ravel())
+            inside = np.minimum(radius, patch.extent - 1e-6)[:, None, None]
+            radians = np.radians(angle)[None, :, None]
+            rows.append(
+                patch.is_black(np.concatenate([inside * np.cos(radians), inside * np.sin(radians)], -1)).ravel()
+            )
         return np.array(rows, np.float32)
 
-    def mirrored(self, inks: Float32) -> Float32:
-        """Inks of the mirror images, (n, cells); the grid's angles must be symmetric about 0."""
+    def mirror_inks(self, inks: Float32) -> Float32:
+        """Return the inks of the mirror images, shape (n, cells); the grid's angles must be symmetric about 0."""
         middle = self.middles()[1] % 360.0
         order = [int(np.argmin(np.abs((middle + a + 180.0) % 360.0 - 180.0))) for a in middle]
         return inks.reshape(len(inks), *self.shape)[:, :, order].reshape(len(inks), -1)
 
-    def cells(self, tolerance: float, reach: float = 0.0) -> list[Float]:
-        """Every cell as a polygon of the patch frame; the outermost ring reaches to ``reach`` at least.
+    def cell_polygons(self, tolerance: float, reach: float = 0.0) -> list[Float]:
+        """Return every cell as a polygon of the patch frame.
 
-        Neighbours share the vertices of their common border, so that cells of one ink add up without a
-        seam. ``tolerance`` is in disc radii, see :func:`kpbench.geometry.outline.flatten`.
+        Neighbours share the vertices of their common border. Cells of one ink therefore add up without a seam.
+
+        Parameters
+        ----------
+        tolerance : float
+            Largest distance between an arc and its chords, in disc radii, see :func:`kpbench.geometry.flatten`.
+        reach : float
+            The outermost ring is extended to this radius if the radius is larger.
         """
         radii = np.append(0.0, self.radii)
         radii[-1] = max(radii[-1], reach)
@@ -117,7 +137,27 @@ def _arc(radius: float, start_deg: float, end_deg: float, tolerance: float) -> F
 
 
 def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Float:
-    """Foreshortened turns of the unit disc, shape (P, 2, 2); those without a turn come first."""
+    """Return foreshortened rotations of the unit disc.
+
+    Parameters
+    ----------
+    turns : int
+        Number of rotations in the plane, evenly spaced over a full turn.
+    tilts_deg : sequence of float
+        Angles between the optical axis and the normal of the patch. A tilt is taken in each of
+        :data:`TILT_DIRECTIONS_DEG`.
+
+    Returns
+    -------
+    ndarray of shape (P, 2, 2)
+        Matrices from the unit disc to px, for a patch of 1 px radius. Attitudes that are not rotated come first.
+
+    Examples
+    --------
+    >>> from kpbench.analysis import attitudes
+    >>> attitudes(turns=1, tilts_deg=(0.0, 60.0)).shape
+    (5, 2, 2)
+    """
 
     def turn(degrees: float) -> Float:
         c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
@@ -127,26 +167,26 @@ def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Flo
     for tilt in tilts_deg:
         if tilt:
             squeeze = np.diag([np.cos(np.radians(tilt)), 1.0])
-            views += [turn(d) @ squeeze @ turn(-d) for d in DIRECTIONS_DEG]
+            views += [turn(d) @ squeeze @ turn(-d) for d in TILT_DIRECTIONS_DEG]
     return np.array([view @ turn(360.0 * n / turns) for n in range(turns) for view in views])
 
 
-def images(
+def render_polygons(
     polygons: Sequence[Float], poses: Float, half: int, blur_px: float = 0.0, mix: Float32 | None = None
 ) -> Float32:
-    """Exact coverage of polygons in a square window about the origin.
+    """Return the exact coverage of polygons in a square about the origin.
 
     Parameters
     ----------
     polygons : sequence of ndarray of shape (N, 2)
     poses : ndarray of shape (P, 2, 3)
-        ``[A | shift]`` from the polygons' frame to px.
+        Affine maps ``[A | shift]`` from the frame of the polygons to px.
     half : int
-        The window has ``2 * half + 1`` pixels a side, the origin in its middle.
+        The side of the square is ``2 * half + 1`` px. The origin is its middle.
     blur_px : float
-        Standard deviation of a Gaussian.
+        Standard deviation of a Gaussian; 0 for none.
     mix : ndarray of shape (M, len(polygons)), optional
-        Weighted sums of the polygons to give instead of the polygons themselves.
+        Weights. The result then holds M weighted sums of the polygons instead of the polygons.
 
     Returns
     -------
@@ -155,10 +195,10 @@ def images(
     wide = half + (int(np.ceil(4 * blur_px)) if blur_px else 0)
     out = []
     for pose in poses:
-        placed = [p @ pose[:, :2].T + pose[:, 2] for p in polygons]
-        boxes = [bounding_box([p]) for p in placed]
+        in_px = [p @ pose[:, :2].T + pose[:, 2] for p in polygons]
+        boxes = [bounding_box([p]) for p in in_px]
         covered = np.zeros((len(polygons), 2 * wide + 1, 2 * wide + 1), np.float32)
-        for window, part, (x, y, w, h) in zip(covered, rasterise([[p] for p in placed], boxes), boxes, strict=True):
+        for window, part, (x, y, w, h) in zip(covered, rasterise([[p] for p in in_px], boxes), boxes, strict=True):
             left, top = max(-wide, x), max(-wide, y)
             right, bottom = min(wide + 1, x + w), min(wide + 1, y + h)
             if left < right and top < bottom:
@@ -166,17 +206,20 @@ def images(
                 window[top + wide : bottom + wide, left + wide : right + wide] = seen
         if mix is not None:
             covered = np.tensordot(mix, covered, 1)
-        out.append(blurred(covered, blur_px, half).reshape(len(covered), -1))
+        out.append(blur_middle(covered, blur_px, half).reshape(len(covered), -1))
     return np.array(out, np.float32)
 
 
-def blurred(stack: Float32, blur_px: float, half: int) -> Float32:
-    """The middle ``2 * half + 1`` pixels of blurred square images, (N, side, side), free of border effects."""
+def blur_middle(stack: Float32, blur_px: float, half: int) -> Float32:
+    """Return the middle ``2 * half + 1`` rows and columns of blurred square images, shape (N, side, side).
+
+    The images are large enough for the kernel. No border therefore enters the result.
+    """
     wide = stack.shape[1] // 2
     if not blur_px:
         return stack[:, wide - half : wide + half + 1, wide - half : wide + half + 1]
-    away = np.arange(-wide, wide + 1) - np.arange(-half, half + 1)[:, None]
-    kernel = np.where(np.abs(away) <= 4 * blur_px, np.exp(-0.5 * (away / blur_px) ** 2), 0.0)
+    offset = np.arange(-wide, wide + 1) - np.arange(-half, half + 1)[:, None]
+    kernel = np.where(np.abs(offset) <= 4 * blur_px, np.exp(-0.5 * (offset / blur_px) ** 2), 0.0)
     kernel = (kernel / kernel.sum(1, keepdims=True)).astype(np.float32)
     return np.asarray(kernel @ stack @ kernel.T)
 
@@ -185,25 +228,38 @@ def _poses(attitude: Float, shift_px: tuple[float, float] = (0.0, 0.0)) -> Float
     return np.concatenate([attitude, np.broadcast_to(np.array(shift_px)[None, :, None], (len(attitude), 2, 1))], 2)
 
 
-def seen_cells(
-    grid: Grid, attitude: Float, seen: float, shift_px: tuple[float, float] = (0.0, 0.0), blur: float = BLUR
+def render_cells(
+    grid: PolarGrid, attitude: Float, seen: float, shift_px: tuple[float, float] = (0.0, 0.0), blur: float = BLUR
 ) -> Float32:
-    """Cells, (P, cells, pixels), of patches so large that ``seen`` of their radius is SEEN_PX."""
-    farthest = np.hypot(HALF + MARGIN, HALF + MARGIN) + np.hypot(*shift_px) + 2
-    reach = farthest * seen / SEEN_PX / np.linalg.svd(attitude, compute_uv=False).min()
-    cells = grid.cells(0.01 * seen / SEEN_PX, float(reach))
-    return images(cells, _poses(SEEN_PX / seen * attitude, shift_px), HALF, blur * SEEN_PX)
+    """Return the images of all cells, shape (P, cells, pixels), in the window.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+    attitude : ndarray of shape (P, 2, 2)
+        See :func:`attitudes`.
+    seen : float
+        Fraction of the patch's radius that the window shows.
+    shift_px : (float, float)
+        Place of the keypoint relative to the middle of the window.
+    blur : float
+        As a fraction of the window's radius.
+    """
+    farthest = np.hypot(HALF_SIDE_PX + BLUR_MARGIN_PX, HALF_SIDE_PX + BLUR_MARGIN_PX) + np.hypot(*shift_px) + 2
+    reach = farthest * seen / WINDOW_PX / np.linalg.svd(attitude, compute_uv=False).min()
+    cells = grid.cell_polygons(0.01 * seen / WINDOW_PX, float(reach))
+    return render_polygons(cells, _poses(WINDOW_PX / seen * attitude, shift_px), HALF_SIDE_PX, blur * WINDOW_PX)
 
 
 def window_weights(attitude: Float) -> Float32:
-    """Weights of the pixels of the seen disc under each attitude, (P, pixels), summing to 1."""
+    """Return the weights of the window's pixels under each attitude, shape (P, pixels); they sum to 1."""
     disc = _arc(1.0, 0.0, 360.0, 1e-3)[:-1]
-    weight = images([disc], _poses(SEEN_PX * attitude), HALF)[:, 0]
+    weight = render_polygons([disc], _poses(WINDOW_PX * attitude), HALF_SIDE_PX)[:, 0]
     return np.asarray(weight / weight.sum(1, keepdims=True))
 
 
-def moments(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
-    """Images of designs without their weighted mean, (n, pixels), and their standard deviations, (n,)."""
+def mean_free_images(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
+    """Return the images of designs minus their weighted mean, shape (n, pixels), and standard deviations, (n,)."""
     image = inks @ cells
     image -= (image @ weight)[:, None]
     spread: Float32 = np.sqrt(np.maximum((image * image) @ weight, np.float32(1e-9)))

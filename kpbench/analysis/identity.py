@@ -1,4 +1,8 @@
-"""How far designs are from each other, from their mirror images, and from themselves in other rotations."""
+"""Identity: how similar designs look to each other, to themselves after a rotation, and to their mirror images.
+
+A distance is a root mean square in units of the ink contrast. A distance of 0.1 at a contrast of 180 grey levels is a
+difference of 18 grey levels per pixel. Noise must reach this difference to make one design look like another.
+"""
 
 from __future__ import annotations
 
@@ -7,92 +11,114 @@ from collections.abc import Callable
 import numpy as np
 
 from kpbench.analysis.cell_images import (
-    DIRECTIONS_DEG,
+    TILT_DIRECTIONS_DEG,
     TILTS_DEG,
     TURNS,
-    Grid,
+    PolarGrid,
     attitudes,
-    moments,
-    seen_cells,
+    mean_free_images,
+    render_cells,
     window_weights,
 )
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
-SEEN_IDENTITY = (1.0, 3 / 4)
-
-
-PAIR_STEPS = len(SEEN_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(DIRECTIONS_DEG))  # calls of progress
+PARTS_OF_IDENTITY = (1.0, 3 / 4)  # fractions of the patch's radius that the window shows
+IDENTITY_STEPS = len(PARTS_OF_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(TILT_DIRECTIONS_DEG))
+"""Number of calls of ``progress`` by :func:`correlation_and_distance`."""
 
 
 def correlation_and_distance(
-    grid: Grid, inks: Float32, progress: Callable[[], None] = lambda: None
+    grid: PolarGrid, inks: Float32, progress: Callable[[int], None] = lambda steps: None
 ) -> tuple[Float32, Float32]:
-    """How alike designs can look, over all pairs of attitudes, of the mirror images too.
+    """Return how similar designs can look, over all pairs of attitudes.
 
-    The first design is seen, blurred, in every tilt of TILTS_DEG; the second may have any attitude, gain
-    (positive) and offset. Mirror images are different prints but are compared as well: the worse counts.
-    The worst of the seen parts SEEN_IDENTITY; both matrices are made symmetric by the worse of the two.
+    The first design is seen, blurred, in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`. The second
+    design has the attitude, the positive gain and the offset with the best match, and is replaced by its mirror image
+    if that matches better. The worst of the fractions :data:`PARTS_OF_IDENTITY` of the patch in the window counts. Both
+    results are symmetric: the worse of the two orders counts.
 
     Parameters
     ----------
-    grid : Grid
-    inks : ndarray of shape (n, cells)
+    grid : PolarGrid
+    inks : ndarray of shape (n, cells), float32
+    progress : callable
+        Called with the number of steps since the call before, :data:`IDENTITY_STEPS` in all.
 
     Returns
     -------
-    correlation : ndarray of shape (n, n)
+    correlation : ndarray of shape (n, n), float32
         Largest normalised correlation.
-    distance : ndarray of shape (n, n)
-        Root mean square of what the best gain and offset leave, in ink contrasts: what noise has to hide.
+    distance : ndarray of shape (n, n), float32
+        Root mean square of the remaining difference, in units of the ink contrast.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import PolarGrid, correlation_and_distance
+    >>> patches = kpbench.shipped_patches()[:2]
+    >>> grid = PolarGrid.of(patches)
+    >>> correlation, distance = correlation_and_distance(grid, grid.inks(patches))
+    >>> round(float(distance[0, 1]), 3)
+    0.215
     """
     view = attitudes()
     flat = attitudes(turns=1)
     weights = window_weights(flat)
-    both = np.concatenate([inks, grid.mirrored(inks)])
+    both = np.concatenate([inks, grid.mirror_inks(inks)])
     n = len(inks)
     correlation = np.zeros((n, n), np.float32)
     distance = np.full((n, n), np.inf, np.float32)
-    for seen in SEEN_IDENTITY:
-        cells = seen_cells(grid, view, seen)
+    for seen in PARTS_OF_IDENTITY:
+        cells = render_cells(grid, view, seen)
         for weight, own in zip(weights, cells[: len(flat)], strict=True):
             keep = weight > 0
-            first, spread = moments(weight[keep], own[:, keep], inks)
+            first, spread = mean_free_images(weight[keep], own[:, keep], inks)
             first = first * weight[keep] / spread[:, None]
             best = np.zeros((n, 2 * n), np.float32)
             for other in cells[:, :, keep]:
-                second, other_spread = moments(weight[keep], other, both)
+                second, other_spread = mean_free_images(weight[keep], other, both)
                 np.maximum(best, first @ (second / other_spread[:, None]).T, out=best)
             worse = np.minimum(np.maximum(best[:, :n], best[:, n:]), 1.0)
             np.maximum(correlation, worse, out=correlation)
             np.minimum(distance, spread[:, None] * np.sqrt(1 - worse**2), out=distance)
-            progress()
+            progress(1)
     return np.maximum(correlation, correlation.T), np.minimum(distance, distance.T)
 
 
-def turned_distance(grid: Grid, inks: Float32) -> Float:
-    """Smallest distance of each design to itself, turned in the plane by 45 degrees or more, shape (n,)."""
-    return _distance_turned(grid, inks, inks, range(TURNS // 8, TURNS - TURNS // 8 + 1))
+def turned_distance(grid: PolarGrid, inks: Float32) -> Float:
+    """Return the smallest distance of each design to itself rotated by 45 degrees or more, shape (n,)."""
+    return _distance_over_turns(grid, inks, inks, range(TURNS // 8, TURNS - TURNS // 8 + 1))
 
 
-def mirrored_distance(grid: Grid, inks: Float32) -> Float:
-    """Smallest distance of each design to its mirror image, turned in the plane by any angle, shape (n,)."""
-    return _distance_turned(grid, inks, grid.mirrored(inks), range(TURNS))
+def mirrored_distance(grid: PolarGrid, inks: Float32) -> Float:
+    """Return the smallest distance of each design to its mirror image in any rotation, shape (n,)."""
+    return _distance_over_turns(grid, inks, grid.mirror_inks(inks), range(TURNS))
 
 
-def _distance_turned(grid: Grid, inks: Float32, others: Float32, turns: range) -> Float:
+def _distance_over_turns(grid: PolarGrid, inks: Float32, others: Float32, turns: range) -> Float:
     weight = window_weights(np.eye(2)[None])[0]
-    views = seen_cells(grid, attitudes(TURNS, (0.0,)), 1.0)
-    first, spread = moments(weight, views[0], inks)
+    views = render_cells(grid, attitudes(TURNS, (0.0,)), 1.0)
+    first, spread = mean_free_images(weight, views[0], inks)
     best = np.zeros(len(inks))
     for turn in turns:
-        other, other_spread = moments(weight, views[turn], others)
+        other, other_spread = mean_free_images(weight, views[turn], others)
         best = np.maximum(best, np.einsum("np,np,p->n", first, other, weight) / (spread * other_spread))
     return np.asarray(spread * np.sqrt(np.maximum(1 - best**2, 0)))
 
 
 def symmetry_order(patch: Patch) -> int:
-    """How many rotations of a full turn leave the print as it is: 1 for a unique orientation, 0 for all."""
+    """Return the number of rotations within a full turn that leave the print unchanged.
+
+    1 means that the orientation is unique, 0 that every rotation leaves the print unchanged.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import symmetry_order
+    >>> [symmetry_order(patch) for patch in kpbench.shipped_patches()]
+    [2, 1, 1, 1]
+    """
     _, angles, black = patch.cells
     if len(angles) == 1:
         return 0

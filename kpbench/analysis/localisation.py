@@ -1,8 +1,4 @@
-"""How well a design tells its centre: bounds of its error, and from how far a fit finds it.
-
-Distances are root mean squares in units of the ink contrast. See :mod:`kpbench.analysis` for how designs are
-rendered, blurred and seen.
-"""
+"""Localisation: how exactly the image of a design determines the centre."""
 
 from __future__ import annotations
 
@@ -12,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from kpbench.analysis.cell_images import (
-    SEEN_PX,
-    Grid,
+    WINDOW_PX,
+    PolarGrid,
     attitudes,
-    images,
-    moments,
-    seen_cells,
+    mean_free_images,
+    render_cells,
+    render_polygons,
     window_weights,
 )
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
@@ -25,20 +21,35 @@ from kpbench.geometry.homography import project_disc
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
-NOISE, CONTRAST = 10.0, 180.0  # grey levels
-
-
-SEEN_BASIN = (1.0, 1 / 2, 1 / 3)
-
-
-SHIFT = 0.25  # of the seen radius
+NOISE = 10.0  # grey levels, standard deviation of the noise in a pixel
+CONTRAST = 180.0  # grey levels, white minus black
+PARTS_OF_BASIN = (1.0, 1 / 2, 1 / 3)  # fractions of the patch's radius that the window shows
+SHIFT = 0.25  # as a fraction of the window's radius
+SHIFT_DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Cramér-Rao bound of the centre in px: worst direction and root mean square over both axes.
+    """Cramér-Rao bound of the centre of a design, over all directions of the tilt.
 
-    The worst over the directions of the tilt. ``blur`` is the blur's standard deviation in disc radii.
+    Attributes
+    ----------
+    radius_px : float
+        Radius of the disc.
+    tilt_deg : float
+        Angle between the optical axis and the normal of the patch.
+    blur : float
+        Standard deviation of the blur, in disc radii.
+    worst_px : float
+        Standard deviation of the centre in its worst direction.
+    rms_px : float
+        Root mean square of the standard deviations along x and y.
+
+    Examples
+    --------
+    >>> from kpbench.analysis import Bound
+    >>> Bound(radius_px=5.0, tilt_deg=0.0, blur=0.2, worst_px=0.02, rms_px=0.018).worst_px
+    0.02
     """
 
     radius_px: float
@@ -48,32 +59,47 @@ class Bound:
     rms_px: float
 
 
-def bound(
+def point_bound(
     cells: Sequence[Float], inks: Float32, attitude: Float, blur_px: float = 0.0, rim: bool = True
 ) -> tuple[Float, Float]:
-    """Cramér-Rao bound of the point at the cells' origin, in px, at NOISE and CONTRAST.
+    """Return the Cramér-Rao bound of the point at the origin of the cells, at :data:`NOISE` and :data:`CONTRAST`.
 
-    Unknown are the point, the 2x2 affine deformation and both inks (8 unknowns); derivatives are central
-    differences of exact renders. Fisher information of a Gaussian: S. Kay, *Fundamentals of Statistical
-    Signal Processing: Estimation Theory*, 1993, eq. 3.31. Around the cells lies a known mid-grey.
+    There are 8 unknowns: the point, the 2x2 affine deformation and both inks. Derivatives are central differences of
+    exact images. The Fisher information of a Gaussian is ``F = J Jᵀ`` for derivatives J divided by the noise (S. Kay,
+    *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, eq. 3.31). A known mid-grey surrounds the
+    cells.
 
     Parameters
     ----------
     cells : sequence of ndarray of shape (N, 2)
-    inks : ndarray of shape (n, len(cells))
+        Polygons that cover the pattern.
+    inks : ndarray of shape (n, len(cells)), float32
+        Inks of n patterns, 1 for black and 0 for white.
     attitude : ndarray of shape (2, 2)
-        From the cells' frame to px.
+        Matrix from the frame of the cells to px.
     blur_px : float
+        Standard deviation of a Gaussian.
     rim : bool
-        False to use only pixels that the cells cover altogether, as on an unknown background.
+        Whether pixels count that lie partly outside the cells. False stands for an unknown background.
 
     Returns
     -------
-    worst_px, rms_px : ndarrays of shape (n,)
-        Standard deviation in the worst direction, and the root mean square over the two axes; infinite
-        where the image does not determine the point.
+    worst_px, rms_px : ndarray of shape (n,)
+        Standard deviation in the worst direction, and the root mean square over x and y. Both are infinite if the image
+        does not determine the point.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.analysis import point_bound
+    >>> square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    >>> cells = [square - (column, row) for row in (0, 1) for column in (0, 1)]
+    >>> checker = np.array([[1, 0, 0, 1]], np.float32)
+    >>> worst_px, rms_px = point_bound(cells, checker, attitude=8.0 * np.eye(2))
+    >>> round(float(worst_px[0]), 3)
+    0.012
     """
-    step = 0.02
+    step = 0.02  # px, of the central differences
     base = np.column_stack([attitude, np.zeros(2)])
     size = max(np.linalg.norm(np.concatenate(list(cells)), axis=1).max(), 1e-9)
     poses = [base]
@@ -85,18 +111,19 @@ def bound(
     half = int(np.ceil(np.abs(np.concatenate(list(cells)) @ attitude.T).max() + 3 * blur_px)) + 2
     sums = np.vstack([inks, np.ones((1, len(cells)), np.float32)])
     if len(sums) < len(cells):
-        parts = images(cells, np.array(poses), half, blur_px, sums)
+        parts = render_polygons(cells, np.array(poses), half, blur_px, sums)
     else:
-        parts = sums @ images(cells, np.array(poses), half, blur_px)
+        parts = sums @ render_polygons(cells, np.array(poses), half, blur_px)
     if not rim:
         parts = parts[:, :, np.all(parts[:, -1] > 1 - 1e-5, axis=0)]
     exact = parts.astype(np.float64).transpose(1, 0, 2)
     black, whole = exact[:-1], exact[-1]
-    image = 0.5 * whole - black  # white is 1/2, black is -1/2, what surrounds them is 0
+    image = 0.5 * whole - black  # white is 1/2, black is -1/2, the surroundings are 0
     geometric = (image[:, 1::2] - image[:, 2::2]) / (2 * step)
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
     F = J @ J.transpose(0, 2, 1)
     nuisance = np.linalg.pinv(F[:, 2:, 2:], rcond=1e-7, hermitian=True)
+    # Schur complement: the information on the point that is left when the other six unknowns are estimated too
     centre = F[:, :2, :2] - F[:, :2, 2:] @ nuisance @ F[:, 2:, :2]
     information = np.linalg.eigvalsh(centre)
     known = information > 1e-5 * F[:, :2, :2].trace(axis1=1, axis2=2)[:, None]
@@ -104,49 +131,95 @@ def bound(
     return np.sqrt(variance.max(1)), np.sqrt(variance.mean(1))
 
 
-def disc_bound(
-    grid: Grid, inks: Float32, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0, rim: bool = True
+def design_bound(
+    grid: PolarGrid, inks: Float32, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0, rim: bool = True
 ) -> tuple[Float, Float]:
-    """:func:`bound` of designs of a radius and tilt; the worst over the directions of the tilt."""
-    cells = grid.cells(0.005 / radius_px)
+    """Return :func:`point_bound` for the centres of designs, in the worst direction of the tilt.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+    inks : ndarray of shape (n, cells), float32
+        See :meth:`PolarGrid.inks`.
+    radius_px : float
+        Radius of the disc.
+    tilt_deg : float
+        Angle between the optical axis and the normal of the patch.
+    blur : float
+        Standard deviation of the blur, in disc radii.
+    rim : bool
+        See :func:`point_bound`.
+
+    Returns
+    -------
+    worst_px, rms_px : ndarray of shape (n,)
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import PolarGrid, design_bound
+    >>> patches = kpbench.shipped_patches()
+    >>> grid = PolarGrid.of(patches)
+    >>> worst_px, rms_px = design_bound(grid, grid.inks(patches), radius_px=8.0)
+    >>> [round(float(px), 3) for px in worst_px]
+    [0.012, 0.012, 0.013, 0.013]
+    """
+    cells = grid.cell_polygons(0.005 / radius_px)
     found = [
-        bound(cells, inks, radius_px * view, blur * radius_px, rim)
+        point_bound(cells, inks, radius_px * view, blur * radius_px, rim)
         for view in attitudes(turns=1, tilts_deg=(tilt_deg,))
     ]
     return np.max([worst for worst, _ in found], axis=0), np.max([rms for _, rms in found], axis=0)
 
 
-def basin(grid: Grid, inks: Float32) -> Float:
-    """How unlike a design is to itself a little off the centre, in any direction and whatever part is seen.
+def basin(grid: PolarGrid, inks: Float32) -> Float:
+    """Return how much each design differs from itself at a small shift.
 
-    A blurred patch is compared with itself shifted by SHIFT of the seen radius, in any attitude. What is
-    left after the best gain and offset, as a root mean square in ink contrasts, is taken in the worst of
-    eight directions, the best attitude, and the worst of the seen parts SEEN_BASIN.
+    A blurred patch is compared with itself shifted by :data:`SHIFT` of the window's radius. The difference that remains
+    after the best gain and offset is a root mean square in units of the ink contrast. The result is the difference in
+    the worst of eight directions of the shift, for the most similar attitude, and for the worst of the fractions
+    :data:`PARTS_OF_BASIN` of the patch in the window.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+    inks : ndarray of shape (n, cells), float32
 
     Returns
     -------
-    ndarray of shape (n,)
+    ndarray of shape (n,), float64
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import PolarGrid, basin
+    >>> patches = kpbench.shipped_patches()[:1]
+    >>> grid = PolarGrid.of(patches)
+    >>> basin(grid, grid.inks(patches)).round(3)  # doctest: +SKIP
+    array([0.175])
     """
     view = attitudes()
     weight = window_weights(np.eye(2)[None])[0]
     least = np.full(len(inks), np.inf)
-    for seen in SEEN_BASIN:
-        still, spread = moments(weight, seen_cells(grid, np.eye(2)[None], seen)[0], inks)
-        for angle in 2 * np.pi * np.arange(8) / 8:
-            shift = (SHIFT * SEEN_PX * np.cos(angle), SHIFT * SEEN_PX * np.sin(angle))
+    for seen in PARTS_OF_BASIN:
+        centred, spread = mean_free_images(weight, render_cells(grid, np.eye(2)[None], seen)[0], inks)
+        for angle in 2 * np.pi * np.arange(SHIFT_DIRECTIONS) / SHIFT_DIRECTIONS:
+            shift = (SHIFT * WINDOW_PX * np.cos(angle), SHIFT * WINDOW_PX * np.sin(angle))
             best = np.zeros(len(inks), np.float32)
-            for cells in seen_cells(grid, view, seen, shift):
-                moved, moved_spread = moments(weight, cells, inks)
-                best = np.maximum(best, np.einsum("np,np,p->n", still, moved, weight) / (spread * moved_spread))
+            for cells in render_cells(grid, view, seen, shift):
+                shifted, shifted_spread = mean_free_images(weight, cells, inks)
+                correlation = np.einsum("np,np,p->n", centred, shifted, weight) / (spread * shifted_spread)
+                best = np.maximum(best, correlation)
             least = np.minimum(least, spread * np.sqrt(np.maximum(1 - best**2, 0)))
     return least
 
 
 def tilt_bias(patch: Patch, radius_px: float = 45.0, tilt_deg: float = 60.0) -> float:
-    """How far the centre of the patch's arcs lies from its keypoint in a tilted view, px.
+    """Return the distance in px between the keypoint and the centre of the patch's arcs, in a tilted view.
 
-    0 where straight edges cross at the keypoint. Else all that tells the centre (at least along an edge) are
-    arcs, whose images' centres are not the image of their centre. Camera of the paper (1624x1240, f = 889 px).
+    The distance is 0 if straight edges cross at the keypoint. Otherwise arcs alone determine the centre, at least along
+    an edge, and the centre of an ellipse is not the image of the circle's centre. The camera is the paper's (1624x1240,
+    focal length 889 px).
     """
     if patch.centre_is_crossing:
         return 0.0

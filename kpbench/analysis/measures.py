@@ -1,9 +1,4 @@
-"""How good a design is: localisation, look-alikes among designs and in nature, pixels needed.
-
-Distances are root mean squares in units of the ink contrast: 0.1 at a contrast of 180 grey levels is a
-difference of 18 grey levels a pixel, which is what noise has to hide. See :mod:`kpbench.analysis` for how
-designs are rendered, blurred and seen.
-"""
+"""All measures of designs: of each design, and between each pair of designs."""
 
 from __future__ import annotations
 
@@ -13,62 +8,62 @@ from typing import Any
 
 import numpy as np
 
-from kpbench.analysis.cell_images import (
-    BLUR,
-    SEEN_PX,
-    TILTS_DEG,
-    Grid,
-)
+from kpbench.analysis.cell_images import BLUR, TILTS_DEG, WINDOW_PX, PolarGrid
 from kpbench.analysis.identity import (
-    PAIR_STEPS,
-    SEEN_IDENTITY,
+    IDENTITY_STEPS,
+    PARTS_OF_IDENTITY,
     correlation_and_distance,
     mirrored_distance,
     symmetry_order,
     turned_distance,
 )
-from kpbench.analysis.localisation import CONTRAST, NOISE, SEEN_BASIN, Bound, basin, disc_bound, tilt_bias
+from kpbench.analysis.localisation import CONTRAST, NOISE, PARTS_OF_BASIN, Bound, basin, design_bound, tilt_bias
 from kpbench.analysis.natural_images import LOOKS_ALIKE, natural_response
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, UInt8
 
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
-ANALYSIS_STEPS = len(SIZES_PX) * len(TILTS_DEG) * 2 + PAIR_STEPS
-
-
-# --- Nature -------------------------------------------------------------------------------------------
-
-
-def pixels_needed(grid: Grid, inks: Float32, samples: int = 128) -> Float:
-    """Disc radius in px at which the smallest region of one ink holds a circle of 2 px diameter, shape (n,)."""
-    from scipy.ndimage import distance_transform_edt, label
-
-    at = (np.arange(samples) + 0.5) * 2 / samples - 1
-    u, v = np.meshgrid(at, at)
-    ring = np.minimum(np.searchsorted(grid.radii, np.hypot(u, v), side="right"), grid.shape[0] - 1)
-    sector = np.searchsorted(grid.angles_deg, np.degrees(np.arctan2(v, u)) % 360.0, side="right") - 1
-    cell = ring * grid.shape[1] + sector % grid.shape[1]
-    inside = np.hypot(u, v) < 1
-    needed = np.empty(len(inks))
-    for n, ink in enumerate(inks):
-        radii = []
-        for region in (inside & (ink[cell] > 0), inside & (ink[cell] == 0)):
-            depth = distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
-            labels, parts = label(region)
-            radii += [depth[labels == part + 1].max() * 2 / samples for part in range(parts)]
-        needed[n] = 1 / min(radii)
-    return needed
-
-
-# --- Report -------------------------------------------------------------------------------------------
+"""Radii of discs at which the bound is computed."""
+MEASURE_STEPS = len(SIZES_PX) * len(TILTS_DEG) * 2 + IDENTITY_STEPS
+"""Number of steps that :func:`measure_designs` reports."""
 
 
 @dataclass(frozen=True)
-class DesignReport:
-    """All measures of one design; lengths in px, distances in ink contrasts.
+class DesignMeasures:
+    """All measures of one design.
 
-    ``bound_without_rim_px`` is the worst direction's bound at 5 px radius where the background is unknown;
-    infinite if the inside alone does not determine the centre.
+    Attributes
+    ----------
+    name : str
+    patch_id : int
+    centre_is_crossing : bool
+        See :attr:`kpbench.Patch.centre_is_crossing`.
+    symmetry_order : int
+        Number of rotations that leave the print unchanged; 0 for all.
+    turned_distance, mirrored_distance : float
+        Smallest distance to itself rotated by 45 degrees or more, and to its mirror image, in ink contrasts.
+    tilt_bias_px : float
+        Distance between the keypoint and the centre of the arcs at a tilt of 60 degrees.
+    black_fraction : float
+        Share of black ink.
+    pixels_needed : float
+        Radius of the disc in px at which the smallest region holds a circle of 2 px diameter.
+    bounds : tuple of Bound
+        One per size, tilt and blur.
+    bound_without_rim_px : float
+        Bound in the worst direction at 5 px radius on an unknown background. Infinite if the inside of the disc alone
+        does not determine the centre.
+    basin : float
+        Difference to itself at a small shift, in ink contrasts.
+    natural_response, natural_response_blurred : tuple of float
+        Shares of places in images whose correlation with the design is greater than 0.8 and than 0.9.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> checker = kpbench.analysis.analyse_patches().analysis.designs[0]  # doctest: +SKIP
+    >>> round(checker.bound_at(radius_px=5.0).worst_px, 4)  # doctest: +SKIP
+    0.0162
     """
 
     name: str
@@ -87,34 +82,48 @@ class DesignReport:
     natural_response_blurred: tuple[float, ...]
 
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
-        """One of :attr:`bounds`."""
+        """Return the bound for a size, a tilt and a blur that were computed."""
         wanted = (radius_px, tilt_deg, blur)
         return next(b for b in self.bounds if (b.radius_px, b.tilt_deg, b.blur) == wanted)
 
 
 @dataclass(frozen=True)
 class Analysis:
-    """Measures of several designs, and between each pair of them."""
+    """Measures of several designs, and of each pair of designs.
 
-    designs: tuple[DesignReport, ...]
+    Attributes
+    ----------
+    designs : tuple of DesignMeasures
+    correlation, distance : ndarray of shape (n, n), float32
+        See :func:`kpbench.analysis.correlation_and_distance`.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> analysis = kpbench.analysis.analyse_patches().analysis  # doctest: +SKIP
+    >>> analysis.nearest(0)[0]  # doctest: +SKIP
+    'mushroom'
+    """
+
+    designs: tuple[DesignMeasures, ...]
     correlation: Float32
     distance: Float32
 
     def nearest(self, n: int) -> tuple[str, float]:
-        """Name of the design that looks most like design n, and its distance; ("", inf) if it is alone."""
+        """Return name and distance of the design that is most similar to design n; ("", inf) if there is no other."""
         others = np.where(np.arange(len(self.designs)) == n, np.inf, self.distance[n])
         closest = int(np.argmin(others))
         return (self.designs[closest].name, float(others[closest])) if len(others) > 1 else ("", float("inf"))
 
     def to_dict(self) -> dict[str, Any]:
-        """The content of the JSON file; infinite bounds are null."""
+        """Return the content of the JSON file; infinite bounds are null."""
         settings = {
             "noise": NOISE,
             "contrast": CONTRAST,
-            "seen_px": SEEN_PX,
+            "seen_px": WINDOW_PX,
             "blur": BLUR,
-            "seen_basin": SEEN_BASIN,
-            "seen_identity": SEEN_IDENTITY,
+            "seen_basin": PARTS_OF_BASIN,
+            "seen_identity": PARTS_OF_IDENTITY,
             "looks_alike": LOOKS_ALIKE,
         }
         table = {
@@ -136,65 +145,100 @@ def _without_infinity(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def analyse(patches: Sequence[Patch], windows: UInt8, progress: Callable[[], None] = lambda: None) -> Analysis:
-    """Measure designs.
+def measure_designs(
+    patches: Sequence[Patch], windows: UInt8, progress: Callable[[int], None] = lambda steps: None
+) -> Analysis:
+    """Return all measures of designs.
 
     Parameters
     ----------
     patches : sequence of Patch
     windows : ndarray of shape (N, side, side), uint8
-        From :func:`sample_windows`.
+        From :func:`kpbench.analysis.background_windows`.
     progress : callable
-        Called now and then, :data:`ANALYSIS_STEPS` times in all.
+        Called with the number of steps since the call before, :data:`MEASURE_STEPS` in all.
     """
-    grid = Grid.of(patches)
+    grid = PolarGrid.of(patches)
     inks = grid.inks(patches)
     bounds: list[list[Bound]] = [[] for _ in patches]
     for radius in SIZES_PX:
         for tilt in TILTS_DEG:
             for blur in (0.0, BLUR):
-                worst, rms = disc_bound(grid, inks, radius, tilt, blur)
+                worst, rms = design_bound(grid, inks, radius, tilt, blur)
                 for n, found in enumerate(bounds):
                     found.append(Bound(radius, tilt, blur, float(worst[n]), float(rms[n])))
-                progress()
-    without_rim = disc_bound(grid, inks, SIZES_PX[0], rim=False)[0]
+                progress(1)
+    without_rim = design_bound(grid, inks, SIZES_PX[0], rim=False)[0]
     correlation, distance = correlation_and_distance(grid, inks, progress)
-    measures = zip(
-        patches,
-        turned_distance(grid, inks),
-        mirrored_distance(grid, inks),
-        _black_fraction(grid, inks),
-        pixels_needed(grid, inks),
-        bounds,
-        without_rim,
-        basin(grid, inks),
-        natural_response(grid, inks, windows),
-        natural_response(grid, inks, windows, BLUR),
-        strict=True,
-    )
-    reports = tuple(
-        DesignReport(
-            p.name,
-            p.patch_id,
-            p.centre_is_crossing,
-            symmetry_order(p),
-            float(turned),
-            float(mirrored),
-            tilt_bias(p),
-            float(black),
-            float(pixels),
-            tuple(found),
-            float(hidden),
-            float(bound_to_centre),
-            tuple(sharp.tolist()),
-            tuple(blurred.tolist()),
+    measures = {
+        "turned_distance": turned_distance(grid, inks),
+        "mirrored_distance": mirrored_distance(grid, inks),
+        "black_fraction": _black_fraction(grid, inks),
+        "pixels_needed": pixels_needed(grid, inks),
+        "bound_without_rim_px": without_rim,
+        "basin": basin(grid, inks),
+    }
+    natural, natural_blurred = (natural_response(grid, inks, windows, blur).tolist() for blur in (0.0, BLUR))
+    designs = tuple(
+        DesignMeasures(
+            name=patch.name,
+            patch_id=patch.patch_id,
+            centre_is_crossing=patch.centre_is_crossing,
+            symmetry_order=symmetry_order(patch),
+            tilt_bias_px=tilt_bias(patch),
+            bounds=tuple(bounds[n]),
+            natural_response=tuple(natural[n]),
+            natural_response_blurred=tuple(natural_blurred[n]),
+            **{name: float(values[n]) for name, values in measures.items()},
         )
-        for p, turned, mirrored, black, pixels, found, hidden, bound_to_centre, sharp, blurred in measures
+        for n, patch in enumerate(patches)
     )
-    return Analysis(reports, correlation, distance)
+    return Analysis(designs, correlation, distance)
 
 
-def _black_fraction(grid: Grid, inks: Float32) -> Float:
+def pixels_needed(grid: PolarGrid, inks: Float32, samples: int = 128) -> Float:
+    """Return the disc radius in px at which the smallest region of one ink holds a circle of 2 px diameter.
+
+    Parameters
+    ----------
+    grid : PolarGrid
+    inks : ndarray of shape (n, cells), float32
+    samples : int
+        Regions are found on a raster of this many samples per diameter.
+
+    Returns
+    -------
+    ndarray of shape (n,), float64
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.analysis import PolarGrid, pixels_needed
+    >>> patches = kpbench.shipped_patches()
+    >>> grid = PolarGrid.of(patches)
+    >>> pixels_needed(grid, grid.inks(patches)).round(1)
+    array([2.4, 3.6, 3.6, 3.6])
+    """
+    from scipy.ndimage import distance_transform_edt, label
+
+    axis = (np.arange(samples) + 0.5) * 2 / samples - 1
+    u, v = np.meshgrid(axis, axis)
+    ring = np.minimum(np.searchsorted(grid.radii, np.hypot(u, v), side="right"), grid.shape[0] - 1)
+    sector = np.searchsorted(grid.angles_deg, np.degrees(np.arctan2(v, u)) % 360.0, side="right") - 1
+    cell = ring * grid.shape[1] + sector % grid.shape[1]
+    inside = np.hypot(u, v) < 1
+    needed = np.empty(len(inks))
+    for n, ink in enumerate(inks):
+        radii = []
+        for region in (inside & (ink[cell] > 0), inside & (ink[cell] == 0)):
+            depth = distance_transform_edt(np.pad(region, 1))[1:-1, 1:-1]
+            labels, parts = label(region)
+            radii += [depth[labels == part + 1].max() * 2 / samples for part in range(parts)]
+        needed[n] = 1 / min(radii)
+    return needed
+
+
+def _black_fraction(grid: PolarGrid, inks: Float32) -> Float:
     radii = np.append(0.0, grid.radii)
     width = np.diff(np.append(grid.angles_deg, grid.angles_deg[0] + 360.0)) / 360.0
     area = np.outer(np.diff(radii**2), width).ravel() / radii[-1] ** 2

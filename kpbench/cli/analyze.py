@@ -51,7 +51,7 @@ def analyze_patches(
       kpbench analyze-patches my-patch.toml my-other-patch.toml --figure mine.svg
       kpbench analyze-patches --search --json search.json
     """
-    from kpbench.analysis.pipeline import analyse_patches, count_steps
+    from kpbench.analysis.analyse import analyse_patches, count_steps
     from kpbench.cli.progress import progress_bar
     from kpbench.patches.design import load_patches
     from kpbench.report.tables import to_plain
@@ -66,7 +66,7 @@ def analyze_patches(
             backgrounds=backgrounds,
             json_file=json_file,
             figure_file=figure_file,
-            progress=lambda: progress(1),
+            progress=progress,
         )
     if found.search:
         click.echo(_search_summary(found.search) + "\n")

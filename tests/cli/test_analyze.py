@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from helpers import kpbench
 
-from kpbench.analysis import measures
+from kpbench.analysis import localisation, measures
 from kpbench.analysis.natural_images import sample_windows
 
 DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
@@ -15,7 +15,7 @@ DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
 def quick(monkeypatch):
     """Fewer sizes and windows: what is printed, not what is measured."""
     monkeypatch.setattr(measures, "SIZES_PX", (5.0, 8.0))
-    monkeypatch.setattr(measures, "SEEN_BASIN", (1.0,))
+    monkeypatch.setattr(localisation, "PARTS_OF_BASIN", (1.0,))
     monkeypatch.setattr(sample_windows, "__defaults__", (400,))
 
 
