@@ -1,4 +1,4 @@
-"""The command that runs a detector."""
+"""``kpbench detect``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     "name",
     default="template",
     show_default=True,
-    help="By name, FILE.onnx, MODULE:ATTR or program:COMMAND.",
+    help="Detector: a name, FILE.onnx, MODULE:ATTR or program:COMMAND.",
 )
 @click.option(
     "--out",
@@ -33,12 +33,12 @@ if TYPE_CHECKING:
 @click.option(
     "--threshold",
     type=FINITE,
-    help="Least score of a detection; default: the detector's own, 0.3 of those that ship.",
+    help="Least score of a detection. Default: the detector's own; the shipped ones have 0.3.",
 )
 @click.option(
     "--overlay",
     type=click.Path(path_type=Path),
-    help="Draw detections: a folder, a video (.mp4), or for a single image a .png.",
+    help="Draw the detections into a folder, a video (.mp4), or a .png of a single image.",
 )
 @PATCHES
 @WORKERS
@@ -53,8 +53,8 @@ def detect(
 ) -> None:
     """Run a detector over SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
 
-    The predictions file (.json, .jsonl, .csv, .parquet, .h5) goes to --out; `kpbench score` reads it. Images
-    of a folder and frames of a video are numbered from 0, in order.
+    --out is a predictions file (.json, .jsonl, .csv, .parquet, .h5), which `kpbench score` reads. The images of a
+    folder and the frames of a video are numbered from 0, in order.
 
     \b
     Examples:
@@ -69,7 +69,7 @@ def detect(
     require_predictions_path(out)
     if overlay is not None:
         refuse_same_folder(source, overlay)
-    detector = _told(name, patches, threshold) if patches else name
+    detector = _load_template(name, patches, threshold) if patches else name
     try:
         run = _run(source, detector, threshold, overlay, workers)
     except KeyboardInterrupt:
@@ -86,7 +86,7 @@ def detect(
 def _run(
     source: str, detector: str | LoadedDetector, threshold: float | None, overlay: Path | None, workers: int | None
 ) -> PredictionRun:
-    """A detector, by name unless it was told its designs, over a dataset or over images."""
+    """Run a detector over a dataset or over images, with a progress bar."""
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.folder import open_dataset
     from kpbench.detectors.prediction import predict, predict_images
@@ -97,7 +97,7 @@ def _run(
         with progress_bar(images.length, "detect") as progress:
             return predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
     dataset = open_dataset(source)
-    if detector in ("template", "superpoint", "superpoint-small") and _others(dataset.config):
+    if detector in ("template", "superpoint", "superpoint-small") and _has_other_designs(dataset.config):
         click.echo(
             f"kpbench: {source} holds other designs than {detector} looks for; use template with --patches, "
             "or weights trained on them",
@@ -107,22 +107,22 @@ def _run(
         return predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
 
 
-def _others(config: dict[str, Any]) -> bool:
-    """Whether a dataset's designs are others than those that ship."""
+def _has_other_designs(config: dict[str, Any]) -> bool:
+    """Return whether a dataset holds other designs than the shipped ones."""
     from kpbench.patches.design import shipped_patches
 
     return "patches" in config and config["patches"] != [patch.to_dict() for patch in shipped_patches()]
 
 
-def _told(name: str, patches: tuple[Path, ...], threshold: float | None) -> LoadedDetector:
-    """The detector that compares images with designs, told which; it then runs in this process alone."""
+def _load_template(name: str, patches: tuple[Path, ...], threshold: float | None) -> LoadedDetector:
+    """Return the template detector for designs of the user; a loaded detector runs in this process alone."""
     from kpbench.detectors.interface import LoadedDetector
     from kpbench.detectors.template import TemplateDetector
     from kpbench.patches.design import load_patches
 
     if name != "template":
         raise click.UsageError(f"--patches is for the template detector; {name} has designs of its own")
-    made = TemplateDetector(load_patches(patches))
+    detector = TemplateDetector(load_patches(patches))
     if threshold is not None:
-        made.threshold = threshold
-    return LoadedDetector(made.name, made.version, made)
+        detector.threshold = threshold
+    return LoadedDetector(detector.name, detector.version, detector)

@@ -18,7 +18,7 @@ VIEW = RNG.uniform(-1, 1, (40, 2, 32, 32)).astype(np.float32)
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
+def small_dataset(tmp_path_factory):
     """Four small images with several patches each."""
     config = replace(kpbench.SynthConfig(4, seed=1, size_px=(240, 180)), deteriorate="none")
     return kpbench.generate(config, tmp_path_factory.mktemp("sets") / "set", workers=1).dataset
@@ -28,18 +28,18 @@ def outputs(file, **inputs):
     return open_session(file.read_bytes())[0].run(None, inputs)
 
 
-def test_the_ellipse_network_is_trained_and_written(dataset, tmp_path):
+def test_the_ellipse_network_is_trained_and_written(small_dataset, tmp_path):
     lines = []
-    train_ellipse([dataset], dataset, tmp_path, epochs=1, batch=64, workers=0, threads=1, say=lines.append)
+    train_ellipse([small_dataset], small_dataset, tmp_path, epochs=1, batch=64, workers=0, threads=1, say=lines.append)
     log_odds, shift, log_map = outputs(tmp_path / "ellipse.onnx", surroundings=SURROUNDINGS)
     assert (log_odds.shape, shift.shape, log_map.shape) == ((3,), (3, 2), (3, 2, 2))
     assert lines[0].startswith("train on ")
     assert lines[-1].endswith("ellipse.onnx: 1380375 bytes")
 
 
-def test_the_judges_are_trained_and_written(dataset, tmp_path):
+def test_the_judges_are_trained_and_written(small_dataset, tmp_path):
     lines = []
-    train_judges([dataset], dataset, tmp_path, epochs=1, batch=64, workers=0, threads=1, say=lines.append)
+    train_judges([small_dataset], small_dataset, tmp_path, epochs=1, batch=64, workers=0, threads=1, say=lines.append)
     for name, columns in ((FIRST_JUDGE, 9), (SECOND_JUDGE, 22)):
         evidence = np.zeros((len(VIEW), columns), np.float32)
         log_odds, shift, log_map = outputs(tmp_path / f"{name}.onnx", view=VIEW, evidence=evidence)
@@ -47,21 +47,25 @@ def test_the_judges_are_trained_and_written(dataset, tmp_path):
     assert any(line.startswith("second judge") for line in lines)
 
 
-def test_a_training_from_the_shipped_weights_begins_with_what_they_give(dataset, tmp_path):
-    train_ellipse([dataset], dataset, tmp_path, epochs=0, from_shipped=True, workers=0, threads=1)
+def test_a_training_from_the_shipped_weights_begins_with_what_they_give(small_dataset, tmp_path):
+    train_ellipse([small_dataset], small_dataset, tmp_path, epochs=0, from_shipped=True, workers=0, threads=1)
     files = tmp_path / "ellipse.onnx", WEIGHTS / "ellipse.onnx"
     ours, shipped = (outputs(file, surroundings=SURROUNDINGS) for file in files)
     for one, other in zip(ours[1:], shipped[1:], strict=True):  # the log odds are calibrated anew
         assert np.abs(one - other).max() < 0.1
 
 
-def test_draws_depend_on_the_images_and_not_on_how_the_folder_is_called(dataset, tmp_path, monkeypatch):
-    shutil.copytree(dataset.path, tmp_path / "copy")
+def test_draws_depend_on_the_images_and_not_on_how_the_folder_is_called(small_dataset, tmp_path, monkeypatch):
+    shutil.copytree(small_dataset.path, tmp_path / "copy")
     monkeypatch.chdir(tmp_path)
-    spellings = [dataset, kpbench.open_dataset("copy"), kpbench.open_dataset(tmp_path / ".." / tmp_path.name / "copy")]
+    spellings = [
+        small_dataset,
+        kpbench.open_dataset("copy"),
+        kpbench.open_dataset(tmp_path / ".." / tmp_path.name / "copy"),
+    ]
     places = [collect_places(image_refs(spelling)[3], True) for spelling in spellings]
     speckled = [read_image(image_refs(spelling)[3], True)[0] for spelling in spellings]
-    plain = read_image(image_refs(dataset)[3], False)[0]
+    plain = read_image(image_refs(small_dataset)[3], False)[0]
     for other, image in zip(places, speckled, strict=True):
         assert all(np.array_equal(one, two) for one, two in zip(other, places[0], strict=True))
         assert np.array_equal(image, speckled[0])
