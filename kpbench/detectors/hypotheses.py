@@ -1,4 +1,4 @@
-"""Hypotheses of the verification: places with a design, a pose, and the evidence for them."""
+"""Hypotheses of the verification: places, each with a design, a pose and evidence."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""Short semi-axes. Of two hypotheses of one design whose centres are nearer than this, the likelier one is kept."""
+"""Short semi-axes. Of two hypotheses of one design with centres nearer than this, the likelier one is kept."""
 
 
 class Evidence(IntEnum):
     """Columns of the evidence that a judge sees.
 
-    The first judge sees the columns up to ``RADIUS``; the second judge, after the fit, sees all. Logs are natural;
-    distances are in short semi-axes.
+    The first judge sees the columns up to ``RADIUS``. The second judge, after the fit, sees all columns. Logs are
+    natural. Distances are in short semi-axes.
     """
 
     NETWORK_SCORE = 0
@@ -124,7 +124,7 @@ def select_likeliest(place: Int, log_odds: Float) -> Int:
 
 
 def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
-    """Return the indices of hypotheses from ``least_log_odds`` on, without near repetitions of the same design."""
+    """Return the indices of hypotheses with at least these log odds, without near repetitions of the same design."""
     likely = np.flatnonzero(log_odds >= least_log_odds)
     kept = [np.zeros(0, np.int64)]
     for design in np.unique(hypotheses.design[likely]):

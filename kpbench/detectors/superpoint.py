@@ -1,8 +1,7 @@
 """The reference detector: SuperPoint's two heads from an ONNX file, decoded in NumPy and OpenCV.
 
-The network gives logits for each cell of 8x8 px. :func:`decode` turns them into keypoints: the local maxima of one
-probability map at full resolution, each moved to the centre of mass of the probability around it, across the borders
-of cells.
+The network gives logits for each cell of 8x8 px. :func:`decode` turns the logits into one probability map at full
+resolution. A keypoint is the centre of mass of the probability around a local maximum, across the borders of cells.
 """
 
 from __future__ import annotations
@@ -30,21 +29,21 @@ CELL_PX = 8
 SCHEMA = "kpbench.superpoint/1"
 """Schema of the metadata in the ONNX file."""
 EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
-"""A cell is empty if the log odds of each of its pixels against "no keypoint" are lower. Nearly all cells are."""
+"""A cell is empty if each of its pixels has lower log odds than this against "no keypoint". Most cells are empty."""
 
-# Settings of the verified detector. The first three were chosen on synthetic images over training photographs, see
-# "Weaker places, longer ellipses, and judges on their poses" and "Fewer looks, and what ten thousand more images were
-# worth" in notebook/training-log.md; the source of the last two is not recorded.
+# Settings of the verified detector. The first three were chosen on synthetic images over training photographs:
+# notebook/training-log.md, "Weaker places, longer ellipses, and judges on their poses" and "Fewer looks, and what ten
+# thousand more images were worth". The source of the last two is not recorded.
 CANDIDATE_SCORE = 0.015
-"""Least score of a place, by the network, that is verified."""
+"""Least score, by the network, of a place that is verified."""
 SCALES = (1.2, 0.5, 0.25)
 """Scales of the image that the network sees: enlarged for small patches, shrunk for large ones."""
 VERIFIED_THRESHOLD = 0.3
 """Least score of a verified detection."""
 MERGE_DISTANCE_PX = 3.0
-"""Of two candidates of different scales that are nearer to each other than this, the better one is kept."""
+"""Of two candidates nearer to each other than this, which different scales may give, the better one is kept."""
 DISC_SHARE = 0.6
-"""Of two centres that are nearer than this many short semi-axes, the likelier one is kept: discs do not overlap."""
+"""Short semi-axes. Of two detections nearer to each other than this, the likelier one is kept."""
 
 
 @dataclass(frozen=True)
@@ -54,14 +53,14 @@ class Decoding:
     Attributes
     ----------
     threshold : float
-        Least probability that a keypoint lies in the window around a maximum, in [0, 1]. Under 0.01 some keypoints
-        may be missed.
+        Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
+        With less than 0.01, some keypoints are missed.
     separation_px : int
-        Of two maxima that are nearer than this, px, the better one is kept. Discs whose short axis measures 10 px and
+        Of two maxima nearer to each other than this, px, the better one is kept. Two discs with short axes of 10 px
         that do not overlap have centres further apart.
     window_px : int
-        Reach of the window around a maximum, px: it is ``2 · window_px + 1`` px wide. Its sum is the score, its
-        centre of mass the place.
+        Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The sum of the
+        probability in the window is the score, the centre of mass is the place.
 
     Examples
     --------
@@ -114,7 +113,7 @@ def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
     side = 2 * decoding.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
-    # a window whose sum reaches the threshold has at least its mean at its maximum, but for the smoothing
+    # a window whose sum reaches the threshold has a maximum of at least its mean; 0.5 allows for the smoothing
     found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])
@@ -190,7 +189,7 @@ def pad_to_cells(grey: UInt8) -> UInt8:
 
 @dataclass
 class SuperPointDetector:
-    """SuperPoint, its candidates verified by the designs; call it with an image.
+    """SuperPoint, with its candidates verified by the designs; call the detector with an image.
 
     Attributes
     ----------
@@ -198,15 +197,15 @@ class SuperPointDetector:
         ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, in 8-bit integers on a
         processor, in float32 on a GPU.
     threshold : float, optional
-        Least score of a detection, in [0, 1]. None: 0.3 where candidates are verified, else 0.5.
+        Least score of a detection, in [0, 1]. None: 0.3 if candidates are verified, else 0.5.
     verified : bool
-        Whether candidates of the network are compared with the designs, which the file holds. The verification then
-        gives centre, identity and score. False: the network alone decides, at the image's own scale. Designs without
-        an edge at the centre cannot be verified; then it becomes False.
+        Whether the candidates of the network are compared with the designs in the file. The verification then gives
+        centre, identity and score. False: the network alone decides, at the image's own scale. It becomes False if a
+        design has no edge at its centre: such a design cannot be verified.
     threads : int
         Threads of the networks; 0 means as many as OpenCV may use.
     scales : tuple of float
-        Scales of the image that the network sees where candidates are verified.
+        Scales of the image that the network sees, if candidates are verified.
     shipped : str
         Name of the shipped weights that ``path=None`` means.
 

@@ -1,17 +1,18 @@
-"""Verification: whether the pixels agree that a place is a patch, which design it is, and where its centre lies.
+"""Verification of a network's candidates by the pixels: is there a patch, of which design, and where is its centre?
 
-A detector's network gives *candidates*: places, each with a score and probabilities of the designs. The verification
-works in these steps.
+A candidate is a place with a score and with probabilities of the designs. The verification works in five steps.
 
-1. :func:`find_ellipses`: a small network looks at the surroundings of each place and gives the ellipse that a patch
-   there fills, and the log odds that there is one.
-2. :func:`propose_poses`: the likely designs are rotated within the ellipse until they agree best with the image.
-3. :func:`judge`: the first judge, a small network, sees each hypothesis in the frame of the patch, beside the design
-   and the measured :class:`~kpbench.detectors.hypotheses.Evidence`. It gives the log odds that the hypothesis is right
-   and corrects its pose. :func:`look_again` shows it the likely ones once more, in the corrected pose.
-4. :func:`fit_hypotheses`: the design is fitted to the pixels (:func:`kpbench.fitting.fit`).
-5. :func:`judge`: the second judge sees the fit, and how the hypothesis compares with the other patches of the image:
-   blur and contrast are much the same for all patches of an image. Its log odds are the result.
+1. Ellipses (:func:`find_ellipses`). A small network sees the surroundings of each place. It gives the ellipse that a
+   patch at this place would fill, and the log odds that the place lies on a patch.
+2. Poses (:func:`propose_poses`). The likely designs are rotated within the ellipse until they agree best with the
+   image. A place with a design and a pose is a hypothesis.
+3. First judge (:func:`judge`). A small network sees each hypothesis: the image in the frame of the patch, the design,
+   and measured :class:`~kpbench.detectors.hypotheses.Evidence`. It gives the log odds that the hypothesis is right, and
+   corrects the pose. Likely hypotheses are shown to the judge once more, in the corrected pose (:func:`look_again`).
+4. Fit (:func:`fit_hypotheses`). The design is fitted to the pixels (:func:`kpbench.fitting.fit`).
+5. Second judge (:func:`judge`). A small network sees the fitted hypothesis. Its evidence also compares the hypothesis
+   with the other patches of the image, as the patches of an image have similar blur and contrast. Its log odds are the
+   result.
 
 :mod:`kpbench.training.verifier` trains the three networks on synthetic images.
 """
@@ -52,49 +53,49 @@ WEIGHTS = Path(__file__).parent / "weights"
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 """Names of the networks, without ``.onnx``."""
 
-# Limits. Chosen on synthetic images over training photographs; notebook/training-log.md has the figures, most of them
-# in "Specks, sizes, and how many places an image has" and in "Fewer looks, and what ten thousand more images were
-# worth".
+# The limits were chosen on synthetic images over training photographs. notebook/training-log.md has the figures, most
+# of them in "Specks, sizes, and how many places an image has" and in "Fewer looks, and what ten thousand more images
+# were worth".
 ID_MARGIN = 3.0
-"""Designs whose log probability by the ID head is lower than the likeliest one's by more than this are not tried."""
+"""A design is tried if its log probability by the ID head is at most this below that of the likeliest design."""
 ALL_DESIGNS_LOG_ODDS = 0.0
-"""Where the ellipse is a patch with at least these log odds, all designs are tried."""
+"""Log odds of an ellipse from which all designs are tried, whatever the ID head says."""
 THOROUGH_LOG_ODDS = -4.8
-"""From these log odds of an ellipse on, other sizes of it are tried, and a second rotation where both look alike."""
+"""Log odds of an ellipse from which other sizes of the ellipse and a second rotation are tried."""
 LEAST_ELLIPSE_LOG_ODDS = -6.5
-"""A place whose ellipse has lower log odds is dropped."""
+"""Log odds of an ellipse below which its place is dropped."""
 SECOND_LOOK_LOG_ODDS = -5.0
-"""A hypothesis that has lower log odds at the first look is dropped."""
+"""Log odds at the first look below which a hypothesis is dropped."""
 LEAST_FIT_LOG_ODDS = -3.5
-"""A hypothesis that has lower log odds before the fit is not fitted."""
+"""Log odds at the second look below which a hypothesis is not fitted."""
 LARGEST_FIT_MOVE = 0.1
-"""Short semi-axes. Where the fit moves a centre further, the pose before the fit is kept: it is right more often."""
+"""Short semi-axes. If the fit moves a centre further, the pose before the fit is kept, as it is right more often."""
 USUAL_PLACES = 70
-"""Candidates of a typical training image of 640x480 px. The judges' log odds hold for images with so many."""
+"""Number of candidates in a typical training image of 640x480 px. The judges' log odds hold for such images."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
-"""Grey levels. Hypotheses of a lower half contrast are dropped; the contrast of a fit counts as at least this."""
+"""Least half contrast of a hypothesis, and least contrast of a fit in the evidence, grey levels."""
 PLACES_PER_BLOCK = 2**11
-"""Places whose surroundings are looked at together: memory does not grow with the image."""
+"""Number of places that the ellipse network sees in one call; it bounds the memory."""
 
 
 @dataclass(frozen=True)
 class VerifiedCandidates:
-    """The n candidates that were worth a fit.
+    """The n candidates that were fitted, each with its likeliest design.
 
     Attributes
     ----------
     place : ndarray of shape (n,), int64
         Index of the candidate.
     design : ndarray of shape (n,), int64
-        Index of its likeliest design.
+        Index of the design.
     xy : ndarray of shape (n, 2)
         Fitted centre, px.
     minor_px : ndarray of shape (n,)
         Short semi-axis of the fitted disc, px.
     score : ndarray of shape (n,)
-        Probability that there is a patch of this design whose centre is right.
+        Probability that there is a patch of this design and that the centre is right.
 
     Examples
     --------
@@ -117,7 +118,7 @@ class VerifiedCandidates:
 def verify_candidates(
     grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
 ) -> VerifiedCandidates:
-    """Compare candidates with the designs that the network holds likely, and fit those that look like a patch.
+    """Compare candidates with the likely designs, and fit the candidates that look like a patch.
 
     Parameters
     ----------
@@ -160,7 +161,7 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # the number of patches in an image does not grow with the number of places that look like one
+    # an image with more candidates than usual does not have more patches, so each candidate is less likely a patch
     log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
@@ -176,7 +177,7 @@ def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Floa
     ----------
     pyramids : Pyramids
     xy : ndarray of shape (n, 2)
-        Places, px, within about half a short semi-axis of the centre.
+        Places, px. The network was trained on places within about half a short semi-axis of a centre.
     threads : int
         As for :func:`verify_candidates`.
 
@@ -187,7 +188,7 @@ def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Floa
     A : ndarray of shape (n, 2, 2)
         Symmetric map of the unit circle to the ellipse, px.
     log_odds : ndarray of shape (n,)
-        That the place lies on a patch.
+        Log odds that the place lies on a patch.
     """
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
     for block in np.split(xy, range(PLACES_PER_BLOCK, len(xy), PLACES_PER_BLOCK)) if len(xy) else ():
@@ -262,7 +263,7 @@ def look_again(pyramids: Pyramids, corrected: Hypotheses, patches: Sequence[Patc
 def _measure(
     pyramids: Pyramids, place: Int, place_xy: Float, poses: Poses, of_networks: Float, templates: DesignTemplates
 ) -> Hypotheses:
-    """Return the hypotheses of some poses with their views and evidence; those of too low a contrast are left out.
+    """Return the hypotheses of some poses with their views and evidence; hypotheses of low contrast are left out.
 
     ``of_networks`` : (n, 4) evidence of the networks, the columns before ``Evidence.NCC``.
     """
@@ -280,9 +281,10 @@ def _measure(
 
 
 def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patches: Sequence[Patch]) -> Hypotheses:
-    """Return the same hypotheses in the poses that fit the pixels best; where a fit moved far, in the pose before.
+    """Return hypotheses in the poses that fit the pixels best, with the evidence of the fit.
 
-    ``log_odds`` : (n,) by the first judge.
+    A hypothesis whose fit moved further than ``LARGEST_FIT_MOVE`` keeps its pose. ``log_odds`` : (n,) by the first
+    judge.
     """
     fits = fit(pyramids.raw, before.xy, before.A, [patches[n] for n in before.design])
     contrast, minor = np.maximum(fits.white - fits.black, LEAST_CONTRAST), clipped_semi_axis(fits.A)
@@ -321,8 +323,9 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
     Returns
     -------
     ndarray of shape (n, 2 + k)
-        Logs of 1 + the number of other hypotheses that are probably right, and probably wrong. Then the difference of
-        each column of ``shared`` from its mean over the right ones; it tends to 0 where there are hardly any.
+        Log of 1 + the number of other hypotheses that are probably right. Log of 1 + the number that are probably
+        wrong. Difference of each column of ``shared`` from its mean over the hypotheses that are probably right; the
+        difference tends to 0 if there are hardly any.
     """
     right = 1 / (1 + np.exp(-log_odds))
     elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]
@@ -338,7 +341,7 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
     Returns
     -------
     log_odds : ndarray of shape (n,)
-        That there is a patch of this design whose centre is right.
+        Log odds that there is a patch of this design and that the centre is right.
     corrected : Hypotheses
         The same hypotheses in the poses that the judge takes for right.
     """

@@ -25,15 +25,15 @@ from kpbench.fitting.templates import DesignTemplates, Templates
 from kpbench.types import Float, Float32, Int
 
 AMBIGUOUS_NCC = 0.15
-"""A second rotation is as likely as the best one if its correlation with the image is less by at most this."""
+"""A second rotation is kept if its correlation with the image is at most this below that of the best rotation."""
 DISTINCT_NCC = 0.5
-"""Two rotations of a design are distinct if they correlate with each other by less than this."""
+"""Two rotations of a design are distinct if their templates correlate by less than this."""
 RADIUS_FACTORS = (0.8, 0.9, 1.1)
-"""Other sizes of an ellipse that are tried: a ring, or the ground around the patch, makes it too large or small."""
+"""Factors of the size of an ellipse that are tried: rings or the ground around a patch may mislead its size."""
 WHOLE_RADIUS_PX = 5.6
 """The whole design is compared in the coarsest level in which its short semi-axis still measures so many px."""
 LARGEST_STEP = 0.35
-"""A Gauss-Newton step is scaled down so that none of its parameters changes by more than this."""
+"""Largest change of a parameter in one Gauss-Newton step; a longer step is shortened."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
         delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
         delta *= np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
         stepped = A @ np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
-        # sectors have no size: a change of size would only follow the blur of the templates, so the size is kept
+        # sectors look the same at every size: the step of the size only fits the blur, so the size is kept
         kept_size = short_semi_axis(A) / np.maximum(short_semi_axis(stepped), 1e-9)
         A = stepped * np.where(has_size, 1.0, kept_size)[:, None, None]
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])

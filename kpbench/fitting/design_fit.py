@@ -20,19 +20,19 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
 COARSE_PX, COARSE_STEPS = 30.0, 2
-"""The first steps are taken in the finest level in which the long semi-axis measures at most ``COARSE_PX`` px."""
+"""The first ``COARSE_STEPS`` steps use the finest level with a long semi-axis of at most ``COARSE_PX`` px."""
 FINE_PX, FINE_STEPS = 100.0, 3
-"""The last steps, likewise."""
+"""The last ``FINE_STEPS`` steps use the finest level with a long semi-axis of at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
-"""Short semi-axes. A patch that a step moved by less is left where it is: the next step would hardly move it."""
+"""Short semi-axes. After a step that moved a patch by less, no further step is taken in the same level."""
 LEVEL_BLUR_PX = 0.6
 """Standard deviation of the blur that one level of the pyramid adds, in its own px."""
 MODEL_REACH = 1.3
 """The rendered design reaches beyond the disc by this factor, so that blur brings no outer edge into the disc."""
 EXPECTED_BEND_PER_PX = 1 / 400
-"""Standard deviation that is expected of the perspective: relative change of distance per px of the radius."""
+"""Prior of the perspective: standard deviation of the relative change of distance over the patch, per px of radius."""
 LEAST_PIXELS = 12
-"""A step needs at least so many pixels inside the disc, and so many on edges."""
+"""Least number of pixels inside the disc, and least number of pixels on edges, for a step."""
 
 
 @dataclass(frozen=True)

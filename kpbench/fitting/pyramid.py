@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from kpbench.types import Float, Float32, Int, UInt8
 
 MOST_LEVELS, LEAST_SIDE_PX = 7, 16
-"""A pyramid has at most so many levels; a level whose shorter side is under ``LEAST_SIDE_PX`` is the last one."""
+"""Largest number of levels, and shorter side of a level that is halved once more, px."""
 REMAP_ROWS = 2**14
-"""Rows that are sampled in one call: OpenCV's remap takes fewer than 2**15."""
+"""Number of poses that are sampled in one call: OpenCV's remap takes fewer than 2**15 rows."""
 LEAST_DEVIATION = 1.0
-"""Grey levels. Regularises correlations: on a surface whose standard deviation is far below this they are near 0."""
+"""Grey levels. Added in quadrature to standard deviations, so that correlations with an even surface are near 0."""
 
 
 def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
@@ -25,8 +25,8 @@ def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
     ----------
     image : ndarray of shape (H, W), uint8
     smooth_px : float
-        Standard deviation of the Gaussian that smooths level 0, px. Each further level is smoothed by about as many
-        of its own px, whatever this value is. 0 leaves level 0 as it is.
+        Standard deviation of the Gaussian that smooths level 0, px. 0 leaves level 0 as it is. Every other level is
+        smoothed by about 0.7 of its own px.
 
     Returns
     -------

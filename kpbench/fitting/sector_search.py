@@ -35,17 +35,17 @@ SPOKES = 40
 RING_RADII = 0.7 * 1.12 ** np.arange(34)
 """Radii of these circles, in radii of the core's circle."""
 FIRST_RINGS = 12
-"""Circles of a first look, which ends the measurement at most places that are no patch."""
+"""Number of circles of the first look; at most places that are no patch it suffices."""
 AGREEING_SHARE = 0.7
 """A circle belongs to the patch if at least this share of its votes is for the predicted ink."""
 VOTING_SHARE = 0.3
 """A circle belongs to the patch if at least this share of its samples votes for the predicted ink."""
 VOTE_OFFSET = 0.4
-"""Subtracted from the agreement (-1 to 1) of each sample: a sample must agree more than this to count in favour."""
+"""A sample votes in favour if its agreement, from -1 to 1, is larger than this."""
 BLOCK = 2**11
-"""Poses that are measured together: memory does not grow with the image."""
+"""Number of poses that are measured together; it bounds the memory."""
 _TILTS = ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9))
-"""Ratio of short to long semi-axis of the tilts that are searched, and the number of directions for each."""
+"""Tilts that are searched: ratio of short to long semi-axis, and number of directions."""
 
 
 @lru_cache(maxsize=1)
@@ -127,7 +127,7 @@ def core_symmetries(poses: Poses, templates: DesignTemplates) -> tuple[Int, Pose
     core, whole = (
         np.bincount(kind.rotated_design, minlength=len(templates.patches)) for kind in (templates.core, templates.whole)
     )
-    # the templates of a design that looks the same n times in a turn hold one in n of all rotations
+    # a design that looks the same n times in a full turn has templates for 1/n of all rotations
     period = 2 * np.pi * core / CORE_ROTATIONS
     symmetries = np.maximum(np.rint(CORE_ROTATIONS / core / (WHOLE_ROTATIONS / whole)), 1).astype(np.int64)
     row = np.repeat(np.arange(len(poses)), symmetries[poses.design])

@@ -22,17 +22,17 @@ CORE_ROTATIONS = 24
 WHOLE_ROTATIONS = 72
 """Rotations of the whole design that are tried: right to 2.5 degrees, where a fit can start."""
 CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
-"""Radii of the circles that are sampled; 1 is the core's own circle, or the rim of the disc."""
+"""Radii of the circles that are sampled, in radii of the core's circle and in radii of the disc."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
-"""Standard deviation of a template's blur, in the same radii: it matches the smoothing of the image pyramid."""
+"""Standard deviation of a template's blur, in the same units: it matches the smoothing of the image pyramid."""
 SAME_NCC = 0.998
-"""Two rotations of a design that correlate by at least this look the same; only the first of them is kept."""
+"""Two rotations of a design look the same if their templates correlate by at least this; one of them is kept."""
 VIEW_REACH = 1.7
-"""Half the side of a view, in radii of the disc: a view shows the disc and the ground around it."""
+"""Half the side of a view, in radii of the disc: a view shows the disc and the ground around the disc."""
 VIEW_PX = 32
 """Side of a view, px."""
 _INK_PX = 273
-"""Side of an ink image, px; it has the reach of a view."""
+"""Side of an ink image, px; an ink image shows as much as a view."""
 _angles_rad = np.arange(CORE_ROTATIONS) * (2 * np.pi / CORE_ROTATIONS)
 _circle = np.column_stack([np.cos(_angles_rad), np.sin(_angles_rad)])
 
@@ -89,7 +89,7 @@ class DesignTemplates:
 
 
 def build_templates(patches: Sequence[Patch]) -> DesignTemplates:
-    """Return the templates of a set of designs; they are kept for the next call."""
+    """Return the templates of a set of designs; the last few sets are cached."""
     return _build_templates(tuple(patches))
 
 
@@ -152,7 +152,8 @@ def draw_ink(patch: Patch, whole: bool) -> Float32:
     fine = 3
     ticks = ((np.arange(_INK_PX * fine) + 0.5) / (_INK_PX * fine) * 2 - 1) * VIEW_REACH
     points = np.stack(np.meshgrid(ticks, ticks), axis=-1)
-    # a point beyond the rim takes the ink at radius 0.999; for the sectors every point takes the ink near the centre
+    # of the whole design, points beyond the rim take the ink at radius 0.999; of the core, all points take the ink of
+    # the innermost sectors
     radius = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
     looked_up = np.minimum(radius, 0.999) if whole else 0.5 * patch.cells[0][1]
     black = patch.is_black(points * (looked_up / radius)[..., None])

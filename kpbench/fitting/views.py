@@ -12,11 +12,11 @@ from kpbench.fitting.templates import VIEW_PX, VIEW_REACH, DesignTemplates, view
 from kpbench.types import Float, Float32, Int
 
 OCTAVES = 4
-"""Octaves of :func:`sample_surroundings`: they reach over 32, 64, 128 and 256 px of the image."""
+"""Number of octaves of :func:`sample_surroundings`; they show 32, 64, 128 and 256 px of the image."""
 INK_LIMIT = 2.5
-"""Inks of a view are clipped to this, in half contrasts."""
+"""Range ± to which the inks of a view are clipped; white is 1 and black is -1."""
 HALF_CONTRAST_RANGE = (2.0, 128.0)
-"""Grey levels; a measured half contrast is clipped to this range."""
+"""Range to which a measured half contrast is clipped, grey levels."""
 
 
 def rectify(

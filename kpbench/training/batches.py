@@ -45,7 +45,7 @@ class SampleConfig:
     size : (int, int)
         Width and height of a sample, px; multiples of 8.
     set_size : int
-        Number of different scenes: sample i shows scene i modulo this number. Crops do not repeat.
+        Number of different scenes. Sample i shows scene i modulo ``set_size``. Crops do not repeat.
 
     Raises
     ------
@@ -77,8 +77,9 @@ class Batch(NamedTuple):
     ----------
     images : ndarray of shape (B, H, W), uint8
     keypoints : ndarray of shape (B, K, 4), float32
-        x and y, px; index of the design, -1 in rows without a keypoint; and ignore radius, px. An ignore radius of 0
-        marks a keypoint that is to be found. Within a larger one nothing is asked for.
+        Columns: x and y, px; index of the design, -1 in rows without a keypoint; and ignore radius, px. An ignore
+        radius of 0 marks a keypoint that is to be found. Any other keypoint is to be ignored: within its ignore
+        radius the network is not trained.
 
     Examples
     --------

@@ -65,7 +65,7 @@ def degrade_crop(
 
 
 def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw a shadow with one straight border, sharp or soft; sometimes a glare, or jagged shadows."""
+    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its least brightness."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:
@@ -86,7 +86,7 @@ def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, floa
 
 
 def _draw_jagged_shadows(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw one or two shadows of five corners anywhere in and around the crop; their sides may cross."""
+    """Draw one or two shadows with five corners anywhere in and around the crop; the sides of a shadow may cross."""
     height, width = work.shape
     light, darkest = np.ones_like(work), 1.0
     for _ in range(rng.integers(1, 3)):
@@ -110,7 +110,10 @@ def _draw_rain(work: Float32, rng: np.random.Generator) -> Float32:
 
 
 def _blur(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
-    """Blur by one of four kernels, narrow enough that a patch of this radius stays visible; return its width too."""
+    """Blur by one of four kernels; return the image and the width of the kernel, px.
+
+    The kernel is narrow enough that a patch of this radius, px, stays visible.
+    """
     widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
     width = float(rng.uniform(1.0, max(widest, 1.5)))
     kind = rng.integers(4)

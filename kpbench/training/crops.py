@@ -1,7 +1,7 @@
 """Training crops: small windows with patches, boards of patches and look-alikes, made a batch at a time.
 
-One core makes several hundred crops per second. A keypoint that no detector could find, because blur or noise has
-buried it, is marked to be ignored: a detection there is neither right nor wrong.
+One core makes several hundred crops per second. A keypoint that blur or noise has buried is marked to be ignored: the
+network is neither trained to find such a keypoint nor trained to pass over it.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ IMAGE_PX = (640, 480)
 ZOOM = (0.35, 3.0)
 """Range of the scale of a background, px of the photograph per px of the crop."""
 VIEW_SCALES = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
-"""Scales at which crops show the image, and the share of crops of each."""
+"""Scale at which a crop shows the image → share of the crops with this scale."""
 ENLARGED_RADIUS_PX = (4.0, 40.0)
 """Range of the radii in enlarged crops, px of the image: larger patches are found at the other scales."""
 LEAST_SIGNAL = 12.0
-"""Least contrast · √area / noise of a keypoint that is asked for: 6 sigmas at the output of a matched filter."""
+"""Least contrast · √area / noise of a keypoint that is to be found: 6 sigmas at the output of a matched filter."""
 LEAST_KEYPOINT_CONTRAST = 4.0
-"""Least contrast of a keypoint that is asked for, grey levels: 8-bit images hold little of a lower one."""
+"""Least contrast of a keypoint that is to be found, grey levels: 8-bit images hold little of a lower contrast."""
 
 
 def empty_keypoints(count: int) -> Float32:
-    """Return keypoints (count, MOST_KEYPOINTS, 4) of samples without any."""
+    """Return keypoints (count, MOST_KEYPOINTS, 4) of samples that have no keypoints."""
     keypoints = np.zeros((count, MOST_KEYPOINTS, 4), np.float32)
     keypoints[..., 2] = -1
     return keypoints
@@ -116,7 +116,7 @@ def cut_window(
 
 
 def _draw_background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
-    """Draw a background: mostly a photograph, of any contrast and brightness, sometimes an even surface."""
+    """Draw a background: mostly a part of a photograph with another contrast and brightness, sometimes an even grey."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
     image = cut_window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
@@ -140,7 +140,7 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         if on_board:
             _draw_paper(image, rng, _poses_at(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    # centres may lie a little outside; the rest of such a patch is visible, but is no keypoint
+    # centres may lie a little outside the crop; a patch whose centre is outside is no keypoint
     at = rng.uniform(-0.1, 1.1, (1 if on_board else count, 2)) * (width, height) - 0.5
     poses = _poses_at(rng, at, limits)
     if on_board:

@@ -1,8 +1,8 @@
-"""Training: one loop over samples that are made on the fly; an interrupted training can go on to the bit.
+"""The training loop, over samples that are made on the fly.
 
 A recipe is a TOML file (:mod:`kpbench.training.recipe`). Progress is counted in samples, so a recipe means the same on
-one processor and on eight accelerators. Batches are a function of recipe and step, so a checkpoint
-(:mod:`kpbench.training.checkpoint`) holds all that is needed to go on.
+one processor and on eight accelerators. A batch is a function of recipe and step. So a training that goes on from a
+checkpoint (:mod:`kpbench.training.checkpoint`) ends in the same weights, to the bit, as one without interruption.
 
 Under ``torchrun`` with n processes, each process takes every n-th batch, and gradients are averaged.
 """
@@ -33,12 +33,12 @@ from kpbench.training.validation import ValidationSets, make_validation_sets, va
 from kpbench.training.weights import load_initial_weights
 
 SAVE_EVERY_S, REPORT_EVERY_S = 300.0, 20.0
-"""Time between checkpoints, and between lines of the log, s."""
+"""Time between checkpoints, and between lines of losses in the log, s."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
-    """How a training runs on this machine.
+    """Options of a training: where it starts, when it stops, and how it uses the machine.
 
     Attributes
     ----------
@@ -139,7 +139,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Training:
-    """All that stays the same while a training runs."""
+    """A training with everything that does not change while it runs."""
 
     recipe: Recipe
     folder: Path
@@ -154,7 +154,7 @@ class _Training:
         return self.folder / "checkpoint.safetensors"
 
     def check(self) -> None:
-        """Raise an error if recipe, designs, processes and folder do not fit together."""
+        """Raise an error if recipe, designs, number of processes and folder do not fit together."""
         ids, count = self.recipe.network.ids, len(self.designs)
         if count != ids:
             raise DataError(f"the network tells {ids} patches apart, but there are {count} designs")
@@ -166,7 +166,7 @@ class _Training:
             raise DataError(f"{self.checkpoint}: nothing to go on from yet; leave `resume` out")
 
     def begin(self, say: Callable[[str], None]) -> TrainingState:
-        """Return the state to go on from."""
+        """Return the state before the next step: fresh, from initial weights, or from the checkpoint."""
         if self.options.threads:
             torch.set_num_threads(self.options.threads)
         state = start_state(self.recipe, self.group.device)
@@ -178,7 +178,7 @@ class _Training:
         return state
 
     def run(self, state: TrainingState, signalled: Callable[[], bool]) -> None:
-        """Train until the recipe is finished, the time is over or a signal was seen; save, validate and log."""
+        """Train until the recipe is finished, the time is over or a signal came; save, validate and log meanwhile."""
         group, options, leads = self.group, self.options, self.group.rank == 0
         validation = self.make_validation() if leads else []
         forward: nn.Module = torch.compile(state.network) if self.recipe.compile else state.network  # type: ignore[assignment]
@@ -215,12 +215,12 @@ class _Training:
                     break
 
     def make_validation(self) -> ValidationSets:
-        """Return the validation sets, over photographs that are not trained on."""
+        """Return the validation sets, made over photographs that the training does not use."""
         photos = load_photos(self.backgrounds, "validation")
         return make_validation_sets(self.recipe, self.designs, photos, self.options.validation_images)
 
     def batches(self, state: TrainingState) -> Iterator[Batch]:
-        """Return the batches of this process, from the step of a state on."""
+        """Return the batches of this process, beginning at the step of a state."""
         recipe, group = self.recipe, self.group
         jobs = (
             BatchJob(step * group.size + group.rank, recipe.batch // group.size, recipe.phase(step)[1])
@@ -232,7 +232,7 @@ class _Training:
 
 @contextmanager
 def _signals_seen() -> Iterator[Callable[[], bool]]:
-    """Note Ctrl-C and SIGTERM, so that the step in hand is finished; yields a function that tells whether one came."""
+    """Catch Ctrl-C and SIGTERM, so that the current step is finished; yield a function that tells whether one came."""
     seen = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield seen.is_set

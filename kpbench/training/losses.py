@@ -20,8 +20,8 @@ class Targets:
     ----------
     place : Tensor of shape (B, 65, h, w)
         Probability of each pixel of the cell, and of "no keypoint"; their sum is 1.
-    asked : Tensor of shape (B, h, w)
-        0 where the detector head is asked for nothing, else 1.
+    valid : Tensor of shape (B, h, w)
+        1 where the detector head is trained, 0 near ignored keypoints.
     identity : Tensor of shape (B, h, w), int64
         Index of the design, or ``ids`` for "no patch".
     near, far : Tensor of shape (B, h, w), bool
@@ -29,7 +29,7 @@ class Targets:
     """
 
     place: Tensor
-    asked: Tensor
+    valid: Tensor
     identity: Tensor
     near: Tensor
     far: Tensor
@@ -71,12 +71,12 @@ def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: st
     columns = torch.arange(w, device=keypoints.device) * CELL_PX + (CELL_PX - 1) / 2
     distance = torch.hypot(xy[:, :, 0, None, None] - columns, xy[:, :, 1, None, None] - rows[:, None])  # (B, K, h, w)
     ignored = ((ignore > 0)[..., None, None] & (distance < ignore[..., None, None] + CELL_PX / 2)).any(1)
-    asked = ~ignored | (mass[:, 0] > 0)
+    valid = ~ignored | (mass[:, 0] > 0)
     distance, nearest = distance.masked_fill(~wanted[..., None, None], float("inf")).min(1)
     near = distance <= CELL_PX
     identity = design.long().gather(1, nearest.flatten(1)).view_as(nearest)
     far = (distance > 2 * CELL_PX) & ~ignored
-    return Targets(target, asked.float(), torch.where(near, identity, ids), near, far)
+    return Targets(target, valid.float(), torch.where(near, identity, ids), near, far)
 
 
 def compute_losses(detector: Tensor, identity: Tensor, targets: Targets, config: LossConfig) -> tuple[Tensor, Tensor]:
@@ -92,11 +92,11 @@ def compute_losses(detector: Tensor, identity: Tensor, targets: Targets, config:
     log_p = F.log_softmax(detector.float(), 1)
     entropy = -(targets.place * log_p).sum(1)
     mass = 1 - targets.place[:, -1]
-    weight = targets.asked * (1 + (config.positive_weight - 1) * mass)
+    weight = targets.valid * (1 + (config.positive_weight - 1) * mass)
     if config.focal:
         empty = log_p[:, -1].exp()
         weight = weight * (mass * empty + (1 - mass) * (1 - empty)).detach() ** config.focal
-    detector_loss = (weight * entropy).sum() / targets.asked.sum().clamp(min=1.0)
+    detector_loss = (weight * entropy).sum() / targets.valid.sum().clamp(min=1.0)
     identity_loss = _hinge if config.identity == "hinge" else _cross_entropy
     return detector_loss, identity_loss(identity.float(), targets, config)
 

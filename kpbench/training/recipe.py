@@ -63,7 +63,7 @@ class NetworkConfig:
 
 @dataclass(frozen=True)
 class LossConfig:
-    """The loss that is minimised: detector + ``identity_weight`` · identity.
+    """The loss that a training minimises: detector loss + ``identity_weight`` · identity loss.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class Phase:
-    """A stretch of the training.
+    """A part of the training.
 
     Attributes
     ----------
@@ -110,7 +110,7 @@ class Phase:
     trains : str
         Weights that are trained: "all", or "attached" (only the attached layers).
     severity : (float, float)
-        Severity of the degradations at its first and its last sample: 0 is clean, 1 is the full range.
+        Severity of the degradations at the first and at the last sample of the phase: 0 is clean, 1 is the full range.
 
     Examples
     --------
@@ -126,7 +126,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A training, but for its photographs, designs and initial weights.
+    """A training recipe: all that decides a training, except photographs, designs and initial weights.
 
     Attributes
     ----------
@@ -263,7 +263,7 @@ def load_recipe(name: str | Path) -> Recipe:
 
 
 def parse_recipe(content: Mapping[str, Any], source: str) -> Recipe:
-    """Return the recipe that a table describes, see :func:`load_recipe`; ``source`` names the file in messages."""
+    """Return the recipe that a table describes; ``source`` names the file in error messages."""
     with name_source(source, DataError):
         return _parse(Recipe, TomlTable(content, get_type_hints(Recipe), DataError))
 

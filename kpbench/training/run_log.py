@@ -1,4 +1,4 @@
-"""What a training tells while it runs: ``log.jsonl``, TensorBoard's files, a progress bar."""
+"""Reports of a running training: ``log.jsonl``, TensorBoard's files, and a progress bar."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Record = Callable[[TrainingState, Mapping[str, Any]], None]
 
 @contextmanager
 def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
-    """Append figures to ``log.jsonl`` and, if asked for, to TensorBoard's files; yields the function to call."""
+    """Append figures to ``log.jsonl`` and, if ``tensorboard``, to TensorBoard's files; yield the function to call."""
     if not active:
         yield lambda state, figures: None
         return
@@ -52,7 +52,7 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
 
 @contextmanager
 def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
-    """Show a progress bar over samples, only on a terminal; yields a function of the step and of a text."""
+    """Show a progress bar over samples, only on a terminal; yield a function of the step and of a text."""
     batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
     hidden = not active or not sys.stderr.isatty()
     with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
@@ -90,7 +90,7 @@ class LossMeter:
 
 
 class Timer:
-    """Tells when a time has passed since the beginning or the last restart."""
+    """Tells whether a time has passed since the timer was made or restarted."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._since = seconds, time.monotonic()

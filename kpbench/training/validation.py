@@ -16,7 +16,7 @@ from kpbench.training.recipe import Recipe
 from kpbench.types import UInt8
 
 FOUND_PX, CLOSE_PX = 3.0, 1.0
-"""Largest distances of a keypoint that is found, and of one that is found exactly, px."""
+"""Largest distance of a detection from a keypoint that counts as found, and as found exactly, px."""
 
 ValidationSets = list[tuple[str, Batch]]
 """Names and samples."""
@@ -47,15 +47,15 @@ def make_validation_sets(
 def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, float]:
     """Measure what a network finds, at the default threshold and without verification.
 
-    :func:`kpbench.score` measures something else: its ε is relative to the radius, which crops do not keep, and it
-    knows no keypoints to be ignored, near which a detection is no false alarm.
+    :func:`kpbench.score` cannot take its place. The ε of ``score`` is relative to the radius, which crops do not keep.
+    And crops have keypoints to be ignored: a detection near such a keypoint is no false alarm.
 
     Returns
     -------
     dict
-        For each set: ``NAME_found_3px`` and ``NAME_found_1px``, the shares of keypoints with a detection that near;
-        ``NAME_id``, the share of right identities among those found within 3 px; ``NAME_alarms``, the number of
-        detections per image that no keypoint explains.
+        For each set NAME: ``NAME_found_3px`` and ``NAME_found_1px``, the shares of keypoints with a detection within
+        3 px and 1 px; ``NAME_id``, the share of right identities among the keypoints found within 3 px;
+        ``NAME_alarms``, the number of detections per image that no keypoint explains.
     """
     network.eval()
     device = next(network.parameters()).device

@@ -22,7 +22,7 @@ from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
 
 BATCHNORM_PX = 128 * 96 * 96
-"""About so many px of samples give the statistics on which BatchNorm starts, but at most 128 and at least 2 samples."""
+"""Number of px of the samples whose statistics initialise BatchNorm; the samples are at least 2 and at most 128."""
 
 
 def load_initial_weights(
@@ -32,7 +32,7 @@ def load_initial_weights(
     backgrounds: str | Path | None,
     device: torch.device,
 ) -> str:
-    """Give a fresh training its initial weights; a network of other sizes grows from them.
+    """Put initial weights into a fresh training; if their network has other sizes, the new network grows from it.
 
     Parameters
     ----------
@@ -150,14 +150,14 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source: str) -> str:
-    """Put a state-dict into a network; the attached layers may be missing and then keep their random weights.
+    """Put a state-dict into a network. It may lack the attached layers, which then keep their random weights.
 
     Parameters
     ----------
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
-        Weights without any BatchNorm are complete, see :func:`restore_batchnorm`.
+        A state-dict without any BatchNorm is complete, see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
@@ -198,8 +198,8 @@ def is_folded(weights: Mapping[str, Tensor]) -> bool:
 def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
     """Make each BatchNorm the identity, by its statistics on some inputs of the network.
 
-    This is the reverse of folding: the network computes what its convolutions alone would compute, and can be
-    trained. ``layers`` : the BatchNorms that are set; None: all.
+    This is the reverse of folding: afterwards the network computes what its convolutions alone compute, and it can be
+    trained. ``layers`` : the BatchNorms that are changed; None: all.
     """
 
     def become_identity(module: nn.Module, given: tuple[Tensor]) -> None:
@@ -224,10 +224,10 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
 def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
     """Start a network from a trained one that is narrower or of another depth (Chen et al., *Net2Net*, ICLR 2016).
 
-    The channels of the smaller network fill the first channels. The other channels keep their random weights, and no
-    trained channel listens to them yet. In each stage, convolutions that the smaller network lacks become the
-    identity, and its convolutions that are too many are left out. The network then computes what the smaller one
-    computes, unless convolutions are left out or the two networks halve the image in different ways.
+    The channels of the smaller network fill the first channels. The other channels keep their random weights; the
+    weights from them to trained channels are 0. In each stage, convolutions that the smaller network lacks become the
+    identity, and surplus convolutions of the smaller network are left out. The network then computes what the smaller
+    network computes, unless convolutions are left out or the two networks halve the image in different ways.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     smaller : SuperPoint
         With BatchNorm, see :func:`restore_batchnorm`.
     images : Tensor of shape (B, 1, H, W)
-        In [0, 1]; they give the statistics of the BatchNorms after convolutions that become the identity.
+        Images in [0, 1]; they give the statistics of the BatchNorms after convolutions that become the identity.
     source : str
         Name of the smaller network, for messages.
 
@@ -248,8 +248,8 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     Raises
     ------
     DataError
-        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of the two: then no
-        convolution can become the identity, as the activation would cut off negative values.
+        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of the networks.
+        Then no convolution can become the identity, as the activation cuts off negative values.
     """
     if "after" in (smaller.config.norm, network.config.norm):
         raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")

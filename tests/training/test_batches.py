@@ -83,12 +83,12 @@ def test_poses_keep_the_papers_limits_wherever_they_are_put(seed):
 
 def test_buried_keypoints_are_ignored_and_clean_ones_are_not(monkeypatch):
     clean = crops(3, 128).keypoints
-    asked = clean[clean[..., 2] >= 0][:, 3] == 0
-    assert 0.8 < asked.mean() < 1.0  # patches of a board may be smaller than the limits
+    wanted = clean[clean[..., 2] >= 0][:, 3] == 0
+    assert 0.8 < wanted.mean() < 1.0  # patches of a board may be smaller than the limits
     monkeypatch.setattr("kpbench.training.crops.degrade_crop", lambda image, *_: (image, 1.0, 0.0, 1e6))
     batch = crops(0, 64)
     present = batch.keypoints[..., 2] >= 0
-    assert (batch.keypoints[present][:, 3] > 0).all()  # the radius within which nothing is asked for
+    assert (batch.keypoints[present][:, 3] > 0).all()  # the ignore radius
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -193,7 +193,7 @@ def test_pixel_targets_are_one_hot_at_the_nearest_pixel():
     assert targets.place[0, :64].sum() == 1
 
 
-def test_identity_is_asked_near_keypoints_and_far_from_all():
+def test_identity_is_trained_near_keypoints_and_far_from_all():
     targets = make_targets(one_keypoint(11.5, 11.5), 64, 64, 4, "split")
     assert targets.identity[0, 1, 1] == 2
     assert targets.near[0].sum() == 5  # the cell and its four neighbours, whose centres are 8 px away
@@ -206,8 +206,8 @@ def test_identity_is_asked_near_keypoints_and_far_from_all():
 def test_ignored_keypoints_ask_for_nothing_around_them():
     targets = make_targets(one_keypoint(11.5, 11.5, ignore=6.0), 64, 64, 4, "split")
     assert targets.place[0, 64].min() == 1
-    assert targets.asked[0, 1, 1] == 0
-    assert targets.asked[0, 5, 5] == 1
+    assert targets.valid[0, 1, 1] == 0
+    assert targets.valid[0, 5, 5] == 1
     assert not targets.near.any()
 
 

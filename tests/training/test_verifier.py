@@ -7,10 +7,10 @@ import pytest
 import kpbench
 from kpbench.detectors.inference import open_session
 from kpbench.detectors.verification import FIRST_JUDGE, SECOND_JUDGE, WEIGHTS
+from kpbench.training.verifier.dataset_images import image_refs
 from kpbench.training.verifier.ellipse import collect_places, train_ellipse
 from kpbench.training.verifier.judge_samples import read_image
 from kpbench.training.verifier.judges import train_judges
-from kpbench.training.verifier.small_networks import image_refs
 
 RNG = np.random.default_rng(0)
 SURROUNDINGS = RNG.uniform(0, 255, (3, 4, 32, 32)).astype(np.float32)

@@ -1,10 +1,10 @@
 """Training of the ellipse network (:func:`kpbench.detectors.verification.find_ellipses`).
 
-The network sees the surroundings of a place in four octaves. It says whether the place lies on a patch, where the
-centre of the patch is, and which ellipse the patch fills, whatever its design. It is trained on the places that the
-detector's network finds (in datasets of the designs that this network knows), and on places around every keypoint, all
-rotated, mirrored and scaled at random. At the end its log odds are scaled so that they hold for the places of a test
-dataset, of which most lie on no patch.
+The ellipse network sees the surroundings of a place in four octaves. It gives the log odds that the place lies on a
+patch, the centre of the patch, and the ellipse that the patch fills; the design of the patch plays no part. The network
+is trained on places that the detector's network finds, and on places around every keypoint. Most of these places are
+rotated and scaled, and all are mirrored, at random. In a dataset of designs that the detector's network does not know,
+only the places around keypoints are used. At the end the log odds are scaled so that they hold for a test dataset.
 """
 
 from __future__ import annotations
@@ -23,20 +23,18 @@ from torch import Tensor, nn
 from kpbench.dataset.folder import Dataset
 from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.detectors.verification import ELLIPSE
+from kpbench.files import make_folder
 from kpbench.fitting.pyramid import Pyramids
 from kpbench.fitting.templates import VIEW_PX
 from kpbench.fitting.views import OCTAVES, sample_surroundings
+from kpbench.training.verifier.dataset_images import ImageRef, map_images
+from kpbench.training.verifier.labels import affine_at_centre, log_ellipse
 from kpbench.training.verifier.small_networks import (
     BATCHNORM_SAMPLES,
     CONTINUED_LEARNING_RATE,
     LEARNING_RATE,
-    ImageRef,
     Say,
-    affine_at_centre,
     load_shipped,
-    log_ellipse,
-    map_images,
-    prepare_training,
     train_one_cycle,
     trunk,
     write_network,
@@ -44,15 +42,16 @@ from kpbench.training.verifier.small_networks import (
 from kpbench.types import Float, Float32, Int
 
 ON_PATCH, OFF_PATCH = 0.6, 1.0
-"""A place lies on a patch within 0.6 short semi-axes of its centre, on no patch beyond 1.0 long semi-axes of all."""
+"""A place lies on a patch up to 0.6 short semi-axes from its centre. A place lies on no patch if it is further than
+1.0 long semi-axes from all centres."""
 EMPTY_PLACES = 14
-"""Places per training image that lie on no patch, at most."""
+"""Largest number of places per training image that lie on no patch."""
 MADE_PLACES, MADE_DEVIATION = 3, 0.22
-"""Places made around each keypoint of a training image, and their standard deviation in short semi-axes."""
+"""Number of places made around each keypoint of a training image, and their standard deviation, short semi-axes."""
 ROTATED_SHARE, OCTAVES_OF_SCALE = 0.7, 0.35
 """Share of training places that are shown rotated and scaled, and the range of the scale, ± octaves."""
 USUAL_LOG_RADIUS = 2.5
-"""Log of a usual radius, px, from which the network starts."""
+"""Log of a usual radius, px; an untrained network predicts about this radius."""
 RADII_PX = ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000))
 """Ranges of the short semi-axis in the report, px."""
 LOG_ODDS = (-8, -7, -6, -5, -4, -2, 0)
@@ -91,7 +90,7 @@ class Places(NamedTuple):
     surroundings : ndarray of shape (n, OCTAVES, VIEW_PX, VIEW_PX), float16
     on_patch : ndarray of shape (n,), bool
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2), float32
-        What the network is asked for; 0 for places on no patch.
+        Targets of the network; 0 for places on no patch.
     """
 
     surroundings: NDArray[np.float16]
@@ -134,7 +133,7 @@ def train_ellipse(
     epochs, batch : int
         Passes over all places, and places per step.
     from_shipped : bool
-        Start from the shipped weights; with ``epochs=0`` the report tells how good these are.
+        Start from the shipped weights. With ``epochs=0`` the report is about the shipped weights.
     workers : int
         Processes that collect places; 0: none but this one.
     threads : int, optional
@@ -155,7 +154,9 @@ def train_ellipse(
     >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
     >>> train_ellipse(sets, kpbench.open_dataset("set-3"), Path("ellipse"), say=print)  # doctest: +SKIP
     """
-    prepare_training(out, threads)
+    make_folder(out)
+    if threads:
+        torch.set_num_threads(threads)
     parts: list[Places] = []
     for dataset in datasets:
         parts += map_images(collect_places, dataset, repeat(True, len(dataset)), workers, str(dataset.path))
@@ -171,15 +172,15 @@ def train_ellipse(
 
 @cache
 def _detector() -> SmallSuperPointDetector:
-    """Return the detector whose places are collected; each process loads it once."""
+    """Return the detector whose places are collected; each process loads the detector once."""
     return SmallSuperPointDetector()
 
 
 def collect_places(image: ImageRef, train: bool) -> Places:
     """Return the places of one image.
 
-    ``train`` : True adds places around the keypoints, leaves out most places on no patch, and rotates and scales.
-    False returns the places as the detector finds them.
+    ``train`` : True adds places around the keypoints, leaves out most places on no patch, and rotates and scales most
+    places. False returns the places as the detector finds them.
     """
     grey, keypoints = image.read()
     rng = image.rng()
@@ -212,7 +213,7 @@ def collect_places(image: ImageRef, train: bool) -> Places:
 
 
 def _match_places(xy: Float, keypoints: NDArray[Any]) -> tuple[Int, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the nearest keypoint of each place, whether the place lies on its patch, and whether it lies on none."""
+    """Return the nearest keypoint of each place, whether the place lies on a patch, and whether it lies on no patch."""
     if not len(keypoints):
         return np.zeros(len(xy), np.int64), np.zeros(len(xy), bool), np.ones(len(xy), bool)
     distance = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"])
@@ -285,10 +286,11 @@ def _mirror(places: PlaceTensors) -> PlaceTensors:
 
 @torch.inference_mode()
 def _report(network: EllipseNetwork, places: PlaceTensors, images: int, say: Say) -> None:
-    """Tell how near the ellipses are to the truth, by short semi-axis, and what limits of the log odds keep.
+    """Report how near the ellipses are to the truth, and how many places each limit of the log odds keeps.
 
-    Per range of the short semi-axis: the share of centres within 0.1 and 0.2 long semi-axes of the truth, before and
-    after, and the share of ellipses whose semi-axes are right to a tenth and to a fifth.
+    Each range of the short semi-axis has a line: the shares of centres within 0.1 and 0.2 long semi-axes of the truth,
+    for the place itself and for the predicted centre; and the shares of ellipses with semi-axes right to a tenth and to
+    a fifth.
     """
     surroundings, on, shift, log_map = places
     out = [network(part.float()) for part in torch.split(surroundings, 1024)]

@@ -20,7 +20,7 @@ from kpbench.types import Float
 class Judge(nn.Module):
     """Views and evidence of hypotheses to log odds and corrections of the pose.
 
-    ``evidence`` : some evidence (n, columns), whose mean and deviation standardise each column.
+    ``evidence`` : some evidence (n, columns); its mean and deviation standardise each column.
     """
 
     mean: Tensor
@@ -43,7 +43,7 @@ class Judge(nn.Module):
         ``view`` (n, 2, VIEW_PX, VIEW_PX) and ``evidence`` (n, columns) are those of
         :func:`kpbench.detectors.hypotheses.judge_inputs`.
         """
-        # beyond what it was trained on, evidence counts no more
+        # evidence outside the range of the training counts no more than its limit
         standard = ((evidence - self.mean) / self.deviation).clamp(-4, 4)
         if self.training:
             standard = standard + 0.05 * torch.randn_like(standard)

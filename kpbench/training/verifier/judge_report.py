@@ -1,4 +1,4 @@
-"""How good judges are: detection scores of a test dataset at several rates of false alarms."""
+"""Report on judges: detection scores of a test dataset at several rates of false alarms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kpbench.types import Float
 FALSE_ALARM_RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 """False alarms per image."""
 REPORTED_SCORES = (0.3, 0.5)
-"""Scores, as probabilities."""
+"""Thresholds of the score, a probability."""
 
 
 def report_judges(
@@ -81,7 +81,7 @@ def _count_explained(
 def _select_reported(
     log_odds: Float, hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return log odds and rightness of the hypotheses that a detector would report, whatever their score."""
+    """Return the hypotheses that a detector would report without a threshold: log odds, and whether each is right."""
     best = select_likeliest(hypotheses.place, log_odds)
     hypotheses, log_odds = hypotheses[best], log_odds[best]
     reach = np.maximum(Decoding.separation_px, DISC_SHARE * short_semi_axis(hypotheses.A))

@@ -25,15 +25,15 @@ from kpbench.detectors.verification import (
     propose_poses,
 )
 from kpbench.fitting.pyramid import Pyramids
+from kpbench.training.verifier.dataset_images import ImageRef
 from kpbench.training.verifier.judge_network import Judge, apply_judge
 from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
-from kpbench.training.verifier.small_networks import ImageRef
 from kpbench.types import Float, UInt8
 
 TRAINING_MARGIN = 1.0
-"""Training looks again at, and fits, hypotheses whose log odds are below the detector's limits by up to this."""
+"""In training, the log odds from which hypotheses are shown again and fitted are lower by this."""
 SPECKLED_EVERY = 3
-"""One in so many training images is strewn with specks."""
+"""One in so many training images has specks."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,8 @@ class ImageLooks:
         Score of each candidate of the network.
     candidate_right : ndarray of shape (n,), bool
     first_look, second_look : Hypotheses
-        Proposed poses, and those that the shipped first judge corrected and would look at again.
+        Hypotheses of the first look, and hypotheses of the second look in the poses that the shipped first judge
+        corrected.
     shipped_log_odds : ndarray
         Log odds of both looks, one after the other, by the shipped first judge.
     """
@@ -68,10 +69,11 @@ class ImageFits:
     Attributes
     ----------
     log_odds : ndarray of shape (n,)
-        By the new first judge, at its second look.
+        Log odds by the new first judge at its second look.
     corrected : Hypotheses
-        In the poses that it takes for right.
+        These hypotheses in the poses that the new first judge corrected.
     fitted : Hypotheses
+        These hypotheses after the fit.
     """
 
     log_odds: Float
@@ -81,7 +83,7 @@ class ImageFits:
 
 @cache
 def load_places_detector(path: Path | None) -> SuperPointDetector:
-    """Return the detector whose candidates are judged; each process loads it once."""
+    """Return the detector whose candidates are judged; each process loads the detector once."""
     return SuperPointDetector(path) if path else SmallSuperPointDetector()
 
 
@@ -91,7 +93,10 @@ def _unpack_judge(packed: bytes) -> Judge:
 
 
 def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
-    """Return the hypotheses of one image at the first judge's two looks; ``train`` adds specks and weak hypotheses."""
+    """Return the hypotheses of one image at the two looks of the first judge.
+
+    ``train`` : draw specks into the image, and show less likely hypotheses again.
+    """
     detector = load_places_detector(detector_path)
     grey, keypoints = read_image(image, train)
     xy, score, log_id = detector.candidates([grey])[0]
@@ -115,8 +120,8 @@ def collect_fits(
 ) -> ImageFits:
     """Return the hypotheses of one image after two looks of the new first judge and after the fit.
 
-    ``train`` : lower the limits of the detector. The first judge knows the images that trained it too well, and would
-    leave too few wrong hypotheses for the second judge.
+    ``train`` : draw the same specks, and fit less likely hypotheses. The first judge is very sure about the images that
+    trained it; without less likely hypotheses the second judge would see too few wrong ones.
     """
     patches, new_judge = load_places_detector(detector_path).patches, _unpack_judge(packed_judge)
     pyramids, margin = Pyramids(read_image(image, train)[0]), TRAINING_MARGIN if train else 0.0
@@ -133,9 +138,9 @@ def collect_fits(
 
 
 def read_image(image: ImageRef, speckle: bool) -> tuple[UInt8, NDArray[Any]]:
-    """Return one image in grey and its keypoints; with ``speckle``, one image in three has specks beside its patches.
+    """Return one image in grey and its keypoints; with ``speckle``, one image in three gets specks beside its patches.
 
-    Specks measure 1 to 6 px. They stand for hot pixels, dust, and leaves and windows far away, which look most like
+    Specks measure 1 to 6 px. They stand for hot pixels, dust, distant leaves and distant windows: these look most like
     small patches.
     """
     grey, keypoints = image.read()

@@ -1,12 +1,12 @@
 """Training of the two judges (:func:`kpbench.detectors.verification.judge`).
 
-Both judges have the same small network. For the first judge, before the fit, a hypothesis is right if its centre lies
-within a fifth of the radius of a keypoint of its design; for the second, after the fit, within a tenth. Of two
-rotations of a design at one place, the better one is right. Each judge also learns the error of the pose.
+Both judges have the same small network. A hypothesis is right if its centre lies near a keypoint of its design: within
+a fifth of the radius for the first judge, before the fit, and within a tenth for the second judge, after the fit. Of
+two rotations of a design at one place, only the better one is right. Each judge also learns to correct the pose.
 
-The first judge is trained on its first and its second look. The shipped first judge corrects the poses for the second
-look, because the new one does not exist yet. A hypothesis that the shipped first judge already knows is drawn rarely,
-with more weight.
+The first judge is trained on the hypotheses of its first look and of its second look. For the second look, the shipped
+first judge corrects the poses, because the new judge does not exist yet. Hypotheses that the shipped first judge judges
+rightly and surely are drawn rarely, and get more weight.
 """
 
 from __future__ import annotations
@@ -27,7 +27,9 @@ from torch import Tensor, nn
 from kpbench.dataset.folder import Dataset
 from kpbench.detectors.hypotheses import Hypotheses
 from kpbench.detectors.verification import FIRST_JUDGE, SECOND_JUDGE
+from kpbench.files import make_folder
 from kpbench.patches.design import Patch
+from kpbench.training.verifier.dataset_images import map_images
 from kpbench.training.verifier.judge_network import Judge, input_tensors
 from kpbench.training.verifier.judge_report import report_judges
 from kpbench.training.verifier.judge_samples import ImageLooks, collect_fits, collect_looks, load_places_detector
@@ -38,8 +40,6 @@ from kpbench.training.verifier.small_networks import (
     LEARNING_RATE,
     Say,
     load_shipped,
-    map_images,
-    prepare_training,
     train_one_cycle,
     write_network,
 )
@@ -48,7 +48,7 @@ from kpbench.types import Float
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
 """Channels of the first layers of each judge."""
 KNOWN_SHARE = 12.0
-"""A hypothesis that is rightly judged with log odds z is drawn in an epoch with probability KNOWN_SHARE · exp(-z/2)."""
+"""A hypothesis judged rightly with log odds ±z is drawn in an epoch with probability KNOWN_SHARE · exp(-z/2)."""
 
 
 def train_judges(
@@ -69,7 +69,7 @@ def train_judges(
     Parameters
     ----------
     datasets, test, out, epochs, batch, from_shipped, workers, threads, say
-        As for :func:`kpbench.training.train_ellipse`. The report tells detection scores at several rates of false
+        As for :func:`kpbench.training.train_ellipse`. The report gives detection scores at several rates of false
         alarms.
     detector : Path, optional
         Weights whose candidates are judged, written by ``kpbench export-model``. None: ``superpoint-small``.
@@ -87,7 +87,9 @@ def train_judges(
     >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
     >>> train_judges(sets, kpbench.open_dataset("set-3"), Path("judges"), say=print)  # doctest: +SKIP
     """
-    prepare_training(out, threads)
+    make_folder(out)
+    if threads:
+        torch.set_num_threads(threads)
     patches, sets = load_places_detector(detector).patches, [*datasets, test]
     looks = [
         map_images(partial(collect_looks, detector), part, repeat(part is not test, len(part)), workers, f"look {n}")
@@ -113,7 +115,7 @@ def train_judges(
 
 @dataclass(frozen=True)
 class _Settings:
-    """What the trainings of both judges share; the names are those of :func:`train_judges`."""
+    """Settings that the trainings of both judges share, see :func:`train_judges`."""
 
     patches: Sequence[Patch]
     epochs: int
@@ -130,11 +132,11 @@ class LabelledHypotheses:
     ----------
     hypotheses : Hypotheses
     right, near : ndarray of shape (n,), bool
-        Whether each is right, and whether it teaches the pose.
+        Whether each hypothesis is right, and whether its pose is near enough to the truth to learn from.
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
-        Corrections that bring the pose to the truth.
+        Corrections that bring the poses to the truth.
     share : ndarray of shape (n,)
-        Probability with which each is drawn in an epoch; its weight is the inverse.
+        Probability that a hypothesis is drawn in an epoch; its weight is the inverse.
     """
 
     hypotheses: Hypotheses
@@ -152,7 +154,10 @@ def _label(
     known_log_odds: Float,
     tolerance: float,
 ) -> LabelledHypotheses:
-    """Label the hypotheses of many images; an earlier judge gave them ``known_log_odds`` (0: no earlier judge)."""
+    """Label the hypotheses of many images.
+
+    ``known_log_odds`` : log odds by an earlier judge; 0 if there was none.
+    """
     pairs = list(zip(hypotheses, truths, strict=True))
     right = np.concatenate([label_hypotheses(part, patches, truth, tolerance) for part, truth in pairs])
     errors = zip(*(pose_errors(part, patches, truth) for part, truth in pairs), strict=True)
@@ -171,14 +176,14 @@ def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
 
 
 def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], settings: _Settings) -> Judge:
-    """Train the second judge on fitted hypotheses, of which no earlier judge knew anything."""
+    """Train the second judge on fitted hypotheses; no earlier judge has seen them."""
     unknown = np.zeros(sum(map(len, fitted)))
     training = _label(fitted, settings.patches, truths, unknown, FIT_TOLERANCE)
     return _train(training, SECOND_JUDGE, SECOND_WIDTH, settings)
 
 
 def _train(training: LabelledHypotheses, name: str, width: int, settings: _Settings) -> Judge:
-    """Train the judge of that name.
+    """Train a judge.
 
     Minimises the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
     """
@@ -214,7 +219,7 @@ def _train(training: LabelledHypotheses, name: str, width: int, settings: _Setti
 
 
 def _disturb(view: Tensor) -> Tensor:
-    """Return views with other inks of the image and a little noise; the design stays as it is."""
+    """Return views whose image has other inks and a little noise; the design stays as it is."""
     shape = (len(view), 1, 1, 1)
     gain, offset = torch.exp(0.15 * torch.randn(shape)), 0.1 * torch.randn(shape)
     image = view[:, :1] * gain + offset + 0.1 * torch.rand(shape) * torch.randn_like(view[:, :1])

@@ -1,4 +1,4 @@
-"""Labels of hypotheses: which ones are right, and how far their poses are from the truth."""
+"""Labels of hypotheses: whether a hypothesis is right, and how far its pose is from the truth."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ from kpbench.detectors.hypotheses import Hypotheses
 from kpbench.detectors.verification import move_poses
 from kpbench.fitting.templates import build_templates
 from kpbench.patches.design import Patch
-from kpbench.training.verifier.small_networks import affine_at_centre, log_ellipse
 from kpbench.types import Float, Int
 
 POSE_TOLERANCE, FIT_TOLERANCE = 0.2, 0.1
 """Largest distance of a right centre from the truth, before and after the fit, in long semi-axes."""
 NEAR_RADII = 0.5
-"""Long semi-axes. A hypothesis of the right design teaches the pose if its centre is nearer to the truth than this."""
+"""Long semi-axes. A judge learns the pose from hypotheses of the right design with a centre nearer than this."""
 LARGEST_LOG_MAP = 1.0
-"""A hypothesis whose pose is off by more than this in any entry of the log map does not teach the pose."""
+"""A judge does not learn the pose from hypotheses with a larger error in any entry of the log map."""
 
 
 def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
@@ -77,9 +76,9 @@ def pose_errors(
     Returns
     -------
     near : ndarray of shape (n,), bool
-        Hypotheses of the right design whose pose is near the truth; the others have a correction of 0.
+        Whether a hypothesis has the right design and a pose near the truth.
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
-        See :func:`kpbench.detectors.verification.move_poses`.
+        See :func:`kpbench.detectors.verification.move_poses`; 0 where ``near`` is false, or far from the truth.
     """
     shift, log_map = np.zeros((len(hypotheses), 2)), np.zeros((len(hypotheses), 2, 2))
     near = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, NEAR_RADII)
@@ -92,3 +91,14 @@ def pose_errors(
         shift[near] = np.linalg.solve(true_A, (centres[own] - xy)[:, :, None])[:, :, 0]
         near[near] = np.abs(log_map[near]).max(axis=(1, 2)) < LARGEST_LOG_MAP
     return near, shift, log_map
+
+
+def affine_at_centre(H: Float) -> Float:
+    """Return the derivatives (n, 2, 2) of homographies (n, 3, 3) at the origin."""
+    return H[:, :2, :2] / H[:, 2:, 2:] - H[:, :2, 2:] @ H[:, 2:, :2] / H[:, 2:, 2:] ** 2
+
+
+def log_ellipse(A: Float) -> Float:
+    """Return the logarithms (n, 2, 2) of the symmetric maps that give the same ellipses as maps A (n, 2, 2)."""
+    square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
+    return np.asarray(np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes))

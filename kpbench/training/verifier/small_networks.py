@@ -1,114 +1,37 @@
-"""Images, layers, training loop, weights and export that the ellipse network and the judges share."""
+"""Layers, training loop, shipped weights and export that the ellipse network and the judges share."""
 
 from __future__ import annotations
 
 import io
-import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache, partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import cast
 
 import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
 from onnx.numpy_helper import to_array
 from torch import Tensor, nn
-from tqdm import tqdm
 
-from kpbench.dataset.folder import Dataset, open_dataset
 from kpbench.detectors.verification import WEIGHTS
-from kpbench.errors import DataError
 from kpbench.files import write_atomic
-from kpbench.images import to_grey
 from kpbench.training.export import OPSET
 from kpbench.training.quantise import quantise
+from kpbench.training.verifier.dataset_images import progress_bar
 from kpbench.training.weights import restore_batchnorm
-from kpbench.types import Float, UInt8
-from kpbench.workers import run_in_order
 
 WEIGHT_DECAY = 2e-2
+"""Weight decay of AdamW."""
 LEARNING_RATE, CONTINUED_LEARNING_RATE = 3e-3, 2e-3
 """Highest learning rate of a training from random weights, and from the shipped weights."""
 BATCHNORM_SAMPLES = 4096
-"""Samples on whose statistics BatchNorm starts in a training from the shipped weights."""
+"""Number of samples whose statistics initialise BatchNorm in a training from the shipped weights."""
 OUTPUTS = ("odds", "shift", "log_map")
 """Outputs of all three networks: log odds (n,), and the corrections of ``move_poses``, (n, 2) and (n, 2, 2)."""
 
 Say = Callable[[str], None]
 """A function that receives lines for the user."""
-Given = TypeVar("Given")
-Result = TypeVar("Result")
-
-
-@dataclass(frozen=True)
-class ImageRef:
-    """An image of a dataset, cheap to send to a worker process."""
-
-    folder: Path
-    fingerprint: str
-    index: int
-
-    def read(self) -> tuple[UInt8, NDArray[Any]]:
-        """Return the image in grey, and its true keypoints."""
-        image, keypoints = _open_dataset(self.folder, self.fingerprint)[self.index]
-        return to_grey(image), keypoints
-
-    def rng(self) -> np.random.Generator:
-        """Return random numbers that depend on the dataset's content and the index, not on the folder's name."""
-        return np.random.default_rng([int(self.fingerprint[:8], 16), self.index])
-
-
-@cache
-def _open_dataset(folder: Path, fingerprint: str) -> Dataset:
-    """Open a dataset once per process; the fingerprint tells apart datasets that replaced each other in a folder."""
-    return open_dataset(folder)
-
-
-def image_refs(dataset: Dataset) -> list[ImageRef]:
-    """Return the images of a dataset."""
-    return [ImageRef(dataset.path, dataset.fingerprint, n) for n in range(len(dataset))]
-
-
-def map_images(
-    work: Callable[[ImageRef, Given], Result], dataset: Dataset, given: Iterable[Given], workers: int, label: str
-) -> list[Result]:
-    """Return ``work(image, argument)`` for every image of a dataset and its argument.
-
-    Parameters
-    ----------
-    work : callable
-        Can be pickled.
-    dataset : Dataset
-    given : iterable
-        The argument of each image.
-    workers : int
-        Processes; 0: none but this one.
-    label : str
-        Text before the progress bar.
-    """
-    jobs = list(zip(image_refs(dataset), given, strict=True))
-    with progress_bar(label, len(jobs)) as bar:
-        results = []
-        for result in run_in_order(partial(_apply, work), jobs, workers):
-            results.append(result)
-            bar.update()
-    return results
-
-
-def _apply(work: Callable[[ImageRef, Given], Result], job: tuple[ImageRef, Given]) -> Result:
-    return work(*job)
-
-
-@contextmanager
-def progress_bar(label: str, total: int) -> Iterator[Any]:
-    """Show a progress bar on stderr; only on a terminal."""
-    with tqdm(total=total, desc=label, leave=False, disable=not sys.stderr.isatty()) as bar:
-        yield bar
 
 
 def convolution(c_in: int, c_out: int, side: int = 3, stride: int = 1) -> list[nn.Module]:
@@ -181,9 +104,9 @@ def train_one_cycle(
 
 @torch.no_grad()
 def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> None:
-    """Give a network the shipped weights, as near as their 7 bits are.
+    """Give a network the shipped weights, to the precision of their 7 bits.
 
-    The shipped file has no BatchNorm; each BatchNorm becomes the identity, by its statistics on the inputs ``seen``.
+    The shipped file has no BatchNorm. Each BatchNorm becomes the identity; the inputs ``seen`` give its statistics.
     """
     graph = onnx.load(WEIGHTS / f"{name}.onnx").graph
     stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
@@ -238,24 +161,3 @@ def write_network(
     data = bytes(quantise(onnx.load_from_string(buffer.getvalue()), feeds).SerializeToString())
     write_atomic(file, data)
     say(f"{file}: {len(data)} bytes")
-
-
-def prepare_training(out: Path, threads: int | None) -> None:
-    """Make the folder for the weights, and set the threads of PyTorch (None: as they are)."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{out}: cannot be made, {error.strerror}") from None
-    if threads:
-        torch.set_num_threads(threads)
-
-
-def affine_at_centre(H: Float) -> Float:
-    """Return the derivatives (n, 2, 2) of homographies (n, 3, 3) at the origin."""
-    return H[:, :2, :2] / H[:, 2:, 2:] - H[:, :2, 2:] @ H[:, 2:, :2] / H[:, 2:, 2:] ** 2
-
-
-def log_ellipse(A: Float) -> Float:
-    """Return the logarithms (n, 2, 2) of the symmetric maps that give the same ellipses as maps A (n, 2, 2)."""
-    square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
-    return np.asarray(np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes))

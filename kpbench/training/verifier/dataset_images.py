@@ -1,0 +1,99 @@
+"""Images of datasets, handed to worker processes one by one."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from kpbench.dataset.folder import Dataset, open_dataset
+from kpbench.images import to_grey
+from kpbench.types import UInt8
+from kpbench.workers import run_in_order
+
+Given = TypeVar("Given")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class ImageRef:
+    """An image of a dataset, by its position; it is read where it is needed.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the dataset.
+    fingerprint : str
+        Fingerprint of the dataset.
+    index : int
+        Position of the image.
+    """
+
+    folder: Path
+    fingerprint: str
+    index: int
+
+    def read(self) -> tuple[UInt8, NDArray[Any]]:
+        """Return the image in grey and its true keypoints."""
+        image, keypoints = _open_dataset(self.folder, self.fingerprint)[self.index]
+        return to_grey(image), keypoints
+
+    def rng(self) -> np.random.Generator:
+        """Return a generator of random numbers, seeded by the content of the dataset and by the index."""
+        return np.random.default_rng([int(self.fingerprint[:8], 16), self.index])
+
+
+@cache
+def _open_dataset(folder: Path, fingerprint: str) -> Dataset:
+    """Open a dataset once per process. The fingerprint is part of the key: the dataset in a folder may be replaced."""
+    return open_dataset(folder)
+
+
+def image_refs(dataset: Dataset) -> list[ImageRef]:
+    """Return the images of a dataset."""
+    return [ImageRef(dataset.path, dataset.fingerprint, n) for n in range(len(dataset))]
+
+
+def map_images(
+    work: Callable[[ImageRef, Given], Result], dataset: Dataset, given: Iterable[Given], workers: int, label: str
+) -> list[Result]:
+    """Return ``work(image, argument)`` for every image of a dataset and its argument.
+
+    Parameters
+    ----------
+    work : callable
+        Can be pickled.
+    dataset : Dataset
+    given : iterable
+        The argument of each image.
+    workers : int
+        Processes; 0: none but this one.
+    label : str
+        Text before the progress bar.
+    """
+    jobs = list(zip(image_refs(dataset), given, strict=True))
+    with progress_bar(label, len(jobs)) as bar:
+        results = []
+        for result in run_in_order(partial(_apply, work), jobs, workers):
+            results.append(result)
+            bar.update()
+    return results
+
+
+def _apply(work: Callable[[ImageRef, Given], Result], job: tuple[ImageRef, Given]) -> Result:
+    return work(*job)
+
+
+@contextmanager
+def progress_bar(label: str, total: int) -> Iterator[Any]:
+    """Show a progress bar on stderr; only on a terminal."""
+    with tqdm(total=total, desc=label, leave=False, disable=not sys.stderr.isatty()) as bar:
+        yield bar
