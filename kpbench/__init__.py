@@ -10,8 +10,19 @@ Examples
 ['checker', 'trefoil', 'wheel', 'mushroom']
 """
 
-import lazy_loader
+from typing import Any
 
 __version__ = "0.1.0"
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+def __getattr__(name: str) -> Any:
+    """Return a public name. The first use parses ``__init__.pyi``: the command line starts without it."""
+    import lazy_loader
+
+    this = globals()
+    this["__getattr__"], this["__dir__"], this["__all__"] = lazy_loader.attach_stub(__name__, __file__)
+    return this[name] if name in this else this["__getattr__"](name)
+
+
+def __dir__() -> list[str]:
+    return list(__getattr__("__all__"))

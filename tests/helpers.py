@@ -14,7 +14,8 @@ from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions
 def kpbench(*arguments, code=0):
     """Run a command in this process and return its result; it must end with this exit code, by no stray exception."""
     result = CliRunner().invoke(main, [str(argument) for argument in arguments])
-    assert isinstance(result.exception, SystemExit | None), result.exception
+    if not isinstance(result.exception, SystemExit | None):
+        raise result.exception  # for its traceback
     assert result.exit_code == code, result.output
     return result
 

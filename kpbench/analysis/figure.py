@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from kpbench.analysis.cell_images import WINDOW_PX, PolarGrid, render_polygons
-from kpbench.analysis.measures import SIZES_PX, Analysis, DesignMeasures
+from kpbench.analysis.measures import Analysis, DesignMeasures
 from kpbench.geometry.outline import Arc, circle, move, rectangle
 from kpbench.patches.design import Patch
 from kpbench.printing.page import Page, Shape, Text
@@ -41,8 +41,9 @@ def draw_designs(analysis: Analysis, patches: Sequence[Patch]) -> Page:
         shapes += _icon(patch, LEFT + ICON, top + ICON) + _pixels(patch, LEFT + 2 * ICON + 4, top + 1)
         texts.append(Text(f"{design.patch_id} {design.name}", LEFT, top + 2 * ICON + 5, 1.3 * FONT))
         texts.append(Text(_summary(design), LEFT, top + 2 * ICON + 9.5, FONT))
-        bars = [(f"r = {r:g} px", design.bound_at(r).worst_px, FULL_BOUND_PX) for r in SIZES_PX]
-        bars += [(f"r = {SIZES_PX[0]:g} px, tilted 60 deg", design.bound_at(SIZES_PX[0], 60.0).worst_px, FULL_BOUND_PX)]
+        bars = [(f"r = {r:g} px", design.bound_at(r).worst_px, FULL_BOUND_PX) for r in design.sizes_px]
+        least = design.sizes_px[0]
+        bars += [(f"r = {least:g} px, tilted 60 deg", design.bound_at(least, 60.0).worst_px, FULL_BOUND_PX)]
         bars += [("basin", design.basin, FULL_DISTANCE)]
         others = [
             (f"{other.patch_id} {other.name}", float(analysis.distance[n, k]), FULL_DISTANCE)

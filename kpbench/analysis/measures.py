@@ -81,6 +81,11 @@ class DesignMeasures:
     natural_response: tuple[float, ...]
     natural_response_blurred: tuple[float, ...]
 
+    @property
+    def sizes_px(self) -> list[float]:
+        """The radii that bounds were computed for, px, the smallest first."""
+        return sorted({bound.radius_px for bound in self.bounds})
+
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
         """Return the bound for a size, a tilt and a blur that were computed."""
         wanted = (radius_px, tilt_deg, blur)

@@ -75,14 +75,14 @@ def analyze_patches(
 
 def _tables(analysis: Analysis) -> list[Table]:
     """Return the measures as tables with a row per design: bounds, other measures, and distances between designs."""
-    from kpbench.analysis.measures import SIZES_PX
     from kpbench.report.tables import Table
 
     names = [f"{design.patch_id} {design.name}" for design in analysis.designs]
-    sizes = [f"{radius_px:g} px" for radius_px in SIZES_PX]
+    sizes_px = analysis.designs[0].sizes_px
+    sizes = [f"{radius_px:g} px" for radius_px in sizes_px]
     bounds, measures = [], []
     for n, (label, design) in enumerate(zip(names, analysis.designs, strict=True)):
-        worst_px = [design.bound_at(radius_px, tilt).worst_px for tilt in (0.0, 60.0) for radius_px in SIZES_PX]
+        worst_px = [design.bound_at(radius_px, tilt).worst_px for tilt in (0.0, 60.0) for radius_px in sizes_px]
         bounds.append((label, *(f"{value:.4f}" for value in (*worst_px, design.bound_without_rim_px))))
         nearest, distance = analysis.nearest(n)
         measures.append(

@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
+from kpbench.cli.messages import print_warning
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
-if TYPE_CHECKING:
-    from kpbench.detectors.interface import LoadedDetector
-    from kpbench.detectors.prediction import PredictionRun
+SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
+"""Detectors of the shipped designs. Only template takes others, with --patches."""
 
 
 @click.command()
 @click.argument("source")
 @click.option(
     "--detector",
-    "name",
     default="template",
     show_default=True,
-    help="Detector: a name, FILE.onnx, MODULE:ATTR or program:COMMAND.",
+    help="A shipped detector, FILE.onnx, MODULE:ATTR or program:COMMAND.",
 )
 @click.option(
     "--out",
@@ -33,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--threshold",
     type=FINITE,
-    help="Least score of a detection. Default: the detector's own; the shipped ones have 0.3.",
+    help="Least score of a detection. Default: the detector's own; shipped detectors have 0.3.",
 )
 @click.option(
     "--overlay",
@@ -44,7 +42,7 @@ if TYPE_CHECKING:
 @WORKERS
 def detect(
     source: str,
-    name: str,
+    detector: str,
     out: Path,
     threshold: float | None,
     overlay: Path | None,
@@ -53,7 +51,7 @@ def detect(
 ) -> None:
     """Run a detector over SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
 
-    --out is a predictions file (.json, .jsonl, .csv, .parquet, .h5), which `kpbench score` reads. The images of a
+    The command writes a predictions file (.json, .jsonl, .csv, .parquet, .h5) for `kpbench score`. The images of a
     folder and the frames of a video are numbered from 0, in order.
 
     \b
@@ -63,66 +61,33 @@ def detect(
       kpbench detect photos --detector template --patches my-patch.toml
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
     """
-    from kpbench.images import refuse_same_folder
+    from kpbench.cli.progress import progress_bar
+    from kpbench.detectors.interface import load_detector
+    from kpbench.detectors.prediction import predict
+    from kpbench.detectors.sources import has_other_designs, open_source
+    from kpbench.images import ImageSource
+    from kpbench.patches.design import load_patches
     from kpbench.predictions.files import require_predictions_path, write_predictions
 
+    if patches and detector != "template":
+        raise click.UsageError(f"--patches is for the template detector; {detector} has designs of its own")
     require_predictions_path(out)
-    if overlay is not None:
-        refuse_same_folder(source, overlay)
-    detector = _load_template(name, patches, threshold) if patches else name
+    images = open_source(source, overlay)
+    if detector in SHIPPED_DESIGNS_ONLY and not patches and has_other_designs(images):
+        print_warning(
+            f"{source} holds other designs than {detector} looks for; use template with `patches`, "
+            "or weights trained on them"
+        )
+    loaded = load_detector(detector, threshold, load_patches(patches)) if patches else detector
     try:
-        run = _run(source, detector, threshold, overlay, workers)
+        with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
+            run = predict(images, loaded, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{out} is not written; the same command starts anew") from None
     write_predictions(out, run.predictions)
     click.echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
     if run.failures:
         for label, problem in run.failures[:5]:
-            click.echo(f"kpbench: {label}: {problem}", err=True)
-        click.echo(f"kpbench: {len(run.failures)} images failed, they count as no detections", err=True)
+            print_warning(f"{label}: {problem}")
+        print_warning(f"{len(run.failures)} images failed, they count as no detections")
         raise SystemExit(1)
-
-
-def _run(
-    source: str, detector: str | LoadedDetector, threshold: float | None, overlay: Path | None, workers: int | None
-) -> PredictionRun:
-    """Run a detector over a dataset or over images, with a progress bar."""
-    from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.folder import open_dataset
-    from kpbench.detectors.prediction import predict, predict_images
-    from kpbench.images import open_images
-
-    if not ((Path(source) / "dataset.json").exists() or any(Path(source).glob("shard-*.h5"))):
-        images = open_images(source, exclude=overlay)
-        with progress_bar(images.length, "detect") as progress:
-            return predict_images(images, detector, threshold=threshold, overlay=overlay, progress=progress)
-    dataset = open_dataset(source)
-    if detector in ("template", "superpoint", "superpoint-small") and _has_other_designs(dataset.config):
-        click.echo(
-            f"kpbench: {source} holds other designs than {detector} looks for; use template with --patches, "
-            "or weights trained on them",
-            err=True,
-        )
-    with progress_bar(len(dataset), "detect") as progress:
-        return predict(dataset, detector, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
-
-
-def _has_other_designs(config: dict[str, Any]) -> bool:
-    """Return whether a dataset holds other designs than the shipped ones."""
-    from kpbench.patches.design import shipped_patches
-
-    return "patches" in config and config["patches"] != [patch.to_dict() for patch in shipped_patches()]
-
-
-def _load_template(name: str, patches: tuple[Path, ...], threshold: float | None) -> LoadedDetector:
-    """Return the template detector for designs of the user; a loaded detector runs in this process alone."""
-    from kpbench.detectors.interface import LoadedDetector
-    from kpbench.detectors.template import TemplateDetector
-    from kpbench.patches.design import load_patches
-
-    if name != "template":
-        raise click.UsageError(f"--patches is for the template detector; {name} has designs of its own")
-    detector = TemplateDetector(load_patches(patches))
-    if threshold is not None:
-        detector.threshold = threshold
-    return LoadedDetector(detector.name, detector.version, detector)

@@ -5,6 +5,8 @@ from .interface import load_detector as load_detector
 from .prediction import PredictionRun as PredictionRun
 from .prediction import predict as predict
 from .prediction import predict_images as predict_images
+from .sources import has_other_designs as has_other_designs
+from .sources import open_source as open_source
 from .superpoint import Decoding as Decoding
 from .superpoint import SmallSuperPointDetector as SmallSuperPointDetector
 from .superpoint import SuperPointDetector as SuperPointDetector

@@ -21,6 +21,7 @@ import numpy as np
 from kpbench import __version__
 from kpbench.detectors.program import run_program
 from kpbench.errors import DataError
+from kpbench.patches.design import Patch
 from kpbench.types import Detections, UInt8
 
 DETECTORS = {
@@ -121,7 +122,7 @@ class LoadedDetector:
         return found
 
 
-def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
+def load_detector(name: str, threshold: float | None = None, patches: Sequence[Patch] | None = None) -> LoadedDetector:
     """Load a detector by name.
 
     Parameters
@@ -133,11 +134,14 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
         are found.
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own.
+    patches : sequence of Patch, optional
+        Designs that ``template`` looks for. None: the shipped four.
 
     Raises
     ------
     DataError
-        If there is no such detector, or the name stands for something that is no detector.
+        If there is no such detector, the name stands for something that is no detector, or ``patches`` are given to
+        another detector than ``template``.
 
     Examples
     --------
@@ -149,6 +153,8 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
     >>> len(detector(np.full((48, 64), 128, np.uint8)))
     0
     """
+    if patches is not None and name != "template":
+        raise DataError(f"`patches` are for the detector template; {name} has designs of its own")
     if name.startswith(PROGRAM_PREFIX):
         run_many = partial(run_program, name.removeprefix(PROGRAM_PREFIX).strip())
         return LoadedDetector(name, "unknown", lambda image: run_many([image])[0], run_many=run_many)
@@ -163,7 +169,9 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
         )
     found = _import_attribute(DETECTORS.get(name, name))
     try:
-        made = _set_threshold(found() if isinstance(found, type) else found, threshold)
+        if isinstance(found, type):
+            found = found() if patches is None else found(patches)
+        made = _set_threshold(found, threshold)
     except DataError:
         raise
     except (Exception, SystemExit) as error:
@@ -173,7 +181,7 @@ def load_detector(name: str, threshold: float | None = None) -> LoadedDetector:
         raise DataError(f"detector {name!r}: {made!r} cannot be called and has no method detect(image)")
     version = getattr(made, "version", __version__ if name in DETECTORS else None)
     label = name if name in DETECTORS else str(getattr(made, "name", name))
-    identity = None if version is None else _digest_detector(name, str(version), made)
+    identity = None if version is None or patches is not None else _digest_detector(name, str(version), made)
     return LoadedDetector(label, str(version or "unknown"), run, getattr(made, "board", None), identity)
 
 

@@ -50,7 +50,7 @@ ImageResult = tuple[Detections, str]
 
 
 def predict(
-    dataset: Dataset,
+    source: Dataset | ImageSource,
     detector: str | LoadedDetector,
     *,
     threshold: float | None = None,
@@ -58,18 +58,19 @@ def predict(
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
 ) -> PredictionRun:
-    """Run a detector over a dataset.
+    """Run a detector over a dataset, or over images without truth as by :func:`predict_images`.
 
     Parameters
     ----------
-    dataset : Dataset
+    source : Dataset or ImageSource
+        See :func:`open_source`.
     detector : str or LoadedDetector
         A name as for :func:`kpbench.load_detector`, or a loaded detector.
     threshold : float, optional
         Detections of a lower score are dropped. A detector given by name gets it in place of its own threshold. None
         keeps all detections.
     workers : int, optional
-        Processes; None for one per core. A loaded detector stays in this process.
+        Processes; None for one per core. A loaded detector, and images without truth, stay in this process.
     overlay : Path, optional
         Folder or video file to draw the detections into.
     progress : callable
@@ -91,6 +92,9 @@ def predict(
     >>> len(run.predictions), run.failures
     (6, ())
     """
+    if isinstance(source, ImageSource):
+        return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress)
+    dataset = source
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):
         workers = 1

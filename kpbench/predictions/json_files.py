@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import msgspec
 import numpy as np
@@ -21,31 +21,8 @@ from kpbench.predictions.decode import (
     parse_json,
     split_list,
 )
-from kpbench.predictions.header import SCHEMA, make_header, parse_header
+from kpbench.predictions.fields import EXPECTED_IN_RECORD, SCHEMA, ImageRecord, make_header, parse_header
 from kpbench.types import Float, Int, InvalidValue, Predictions, offsets_of
-
-Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
-
-
-class ImageRecord(msgspec.Struct, gc=False, forbid_unknown_fields=True):
-    """The detections in one image."""
-
-    image_id: Int64
-    keypoints: list[tuple[float, float]]
-    scores: list[float] | None = None
-    ids: list[Int64] | None = None
-
-
-EXPECTED_IN_RECORD = {
-    "ids": "a list",
-    "ids[]": "a patch id, 0 or more",
-    "image_id": "a whole number of 64 bits",
-    "keypoints": "a list",
-    "keypoints[]": "two finite numbers",
-    "scores": "a list",
-    "scores[]": "a finite number",
-}
-"""What each field of :class:`ImageRecord` must hold, in words."""
 
 
 def read_json(path: Path) -> Predictions:

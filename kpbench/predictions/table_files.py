@@ -16,13 +16,9 @@ from numpy.typing import NDArray
 
 from kpbench.errors import PredictionsError
 from kpbench.predictions.decode import Place, abbreviate, parse_json
-from kpbench.predictions.header import make_header, parse_header
+from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
 from kpbench.types import Predictions, offsets_of
 
-TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
-"""Columns of CSV and Parquet; score and id are optional."""
-H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
-"""Datasets of an HDF5 file with their kind: whole (i) or any (f) numbers; score and id are optional."""
 LARGEST_RATIO = 1100
 """Bytes that one stored byte of HDF5 may stand for. Gzip compresses by at most 1032."""
 

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from kpbench.geometry.outline import Line, Region, circle, rectangle
+from kpbench.printing.font import FONT_SIZE, SMALLEST_FOOT, font_size
 from kpbench.printing.page import CUT, MARKS, Shape, Text
 from kpbench.printing.page_format import BLANK, PAGE_MARGIN, STRIP, PageFormat
 
 LINE = 0.1  # mm, width of every mark
 TICK_GAP, TICK = 1.0, 2.0  # mm, distance of a cut mark from the cut, and length of the mark
 CROSS_ARM = 2.5  # mm, from the centre of a registration cross to its end
-FONT_SIZE = 2.2  # mm
-SMALLEST_FOOT = 1.2  # mm: a foot in a smaller font moves into the line on top
-CHARACTER_WIDTH = 0.6  # of the font size: no font in use is wider on average, for digits and lower case
 
 
 def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
@@ -81,8 +79,3 @@ def registration_cross() -> Region:
 def _polygon(points: Iterable[tuple[float, float]]) -> Region:
     corners = list(points)
     return (tuple(Line(*a, *b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True)),)
-
-
-def font_size(text: str, width: float) -> float:
-    """Return the font size in mm, at most :data:`FONT_SIZE`, at which a text is no wider than ``width`` mm."""
-    return max(min(FONT_SIZE, width / (CHARACTER_WIDTH * len(text))), 0.5)

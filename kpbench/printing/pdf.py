@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from kpbench.geometry.outline import Line, Region
+from kpbench.printing.font import PDF_FONT
 from kpbench.printing.page import CUT, Page, split_arcs, start_point
 
-PDF_FONT = "Vera"  # ships with reportlab; its licence permits embedding
 PT_PER_MM = 72 / 25.4
-LONGEST_ARC_DEG = 22.5  # of one Bézier curve, whose edge is then off by less than 1e-7 of the radius
+LONGEST_ARC_DEG = 22.5  # of one Bézier curve; the error of the curve is below 1e-7 of the radius
 
 
 def to_pdf(pages: Sequence[Page]) -> bytes:
@@ -37,7 +37,7 @@ def to_pdf(pages: Sequence[Page]) -> bytes:
     from reportlab.pdfbase.ttfonts import TTFont
     from reportlab.pdfgen.canvas import FILL_NON_ZERO, Canvas
 
-    font = TTFont(PDF_FONT, "Vera.ttf")
+    font = TTFont(PDF_FONT, f"{PDF_FONT}.ttf")
     pdfmetrics.registerFont(font)
     out = io.BytesIO()
     canvas = Canvas(out, invariant=1, pageCompression=0, initialFontName=PDF_FONT, lang="en")

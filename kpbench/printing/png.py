@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import flatten
+from kpbench.printing.font import png_font
 from kpbench.printing.page import CUT, Page, Text
 
 MAX_PIXELS = 1_000_000_000
@@ -86,9 +87,9 @@ def to_png(page: Page, dpi: float) -> bytes:
 
 def _letters(text: Text, scale: float) -> tuple[NDArray[np.float64], float, float]:
     """Return the coverage of a line of text, and the px from its baseline point to the first column and row."""
-    from PIL import Image, ImageDraw, ImageFont
+    from PIL import Image, ImageDraw
 
-    font = ImageFont.load_default(max(text.size * scale, 1.0))
+    font = png_font(text.size * scale)
     line = text.clean.encode("ascii", "replace").decode()  # the built-in font has no other characters
     anchor = {"start": "ls", "middle": "ms", "end": "rs"}[text.anchor]
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), line, font, anchor)

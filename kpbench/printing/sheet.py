@@ -16,7 +16,8 @@ from kpbench.errors import DesignError
 from kpbench.geometry.outline import move, rectangle
 from kpbench.patches.board import Board
 from kpbench.patches.design import Patch
-from kpbench.printing.marks import TICK, TICK_GAP, crop_mark, disc_marks, font_size, frame, registration_cross
+from kpbench.printing.font import font_size
+from kpbench.printing.marks import TICK, TICK_GAP, crop_mark, disc_marks, frame, registration_cross
 from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, round_to_nm
 from kpbench.printing.page_format import PAGE_MARGIN, PageFormat
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, sidecar_entry, sidecar_head

@@ -5,9 +5,8 @@ from __future__ import annotations
 from xml.sax.saxutils import escape
 
 from kpbench.geometry.outline import Line, Region
+from kpbench.printing.font import SVG_FONTS
 from kpbench.printing.page import INK, MARKS, Page, Text, round_to_nm, split_arcs, start_point
-
-SVG_FONTS = "Helvetica, Arial, sans-serif"
 
 
 def _mm(*values: float) -> str:

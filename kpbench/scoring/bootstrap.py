@@ -25,10 +25,12 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 from kpbench.types import Float, Int
 
+LEVEL = 0.95
+"""Probability that an interval holds the true value."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
-"""Number of different scenes that are drawn one by one; more of them are pooled."""
+"""Largest number of kinds of scenes that are drawn one by one. More kinds are pooled."""
 
 
 def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
@@ -122,7 +124,7 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
     scenes : int
         Number of scenes.
     """
-    half = -stdtrit(scenes - 1, 0.025) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
+    half = -stdtrit(scenes - 1, (1 - LEVEL) / 2) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
     defined = np.isfinite(without_one)
     if not len(values) or not defined.any():
         return np.asarray(ndtr(half))

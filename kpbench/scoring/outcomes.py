@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal
@@ -10,8 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError, PredictionsError
+from kpbench.errors import DataError
 from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
+from kpbench.scoring.fingerprint import find_images
 from kpbench.types import Int, Predictions, Truth
 
 
@@ -188,7 +188,7 @@ def match_predictions(
     settings = settings or Settings()
     if not len(truth):
         raise DataError("the dataset has no images")
-    image = _find_images(truth, predictions, allow_missing)
+    image = find_images(truth, predictions, allow_missing)
     points = _read_points(truth, settings.eps_radius)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
     # A detector that found nothing contradicts no identity, even if its file holds no IDs
@@ -220,31 +220,3 @@ def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
             f"{radius[row]}, expected finite numbers and a radius over 0"
         )
     return TruthPoints(xy, radius, image)
-
-
-def _find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
-    """Return the position in the truth of each detection's image, after checking that the images are the same."""
-    named = predictions.fingerprint or predictions.dataset or ""
-    if re.fullmatch("[0-9a-f]{64}", named) and truth.fingerprint and named != truth.fingerprint:
-        raise PredictionsError(
-            f"made for the dataset with fingerprint {named[:12]}…, but this dataset's is {truth.fingerprint[:12]}…"
-        )
-    order = np.argsort(truth.image_id, kind="stable")
-    ids = truth.image_id[order]
-    if np.any(ids[1:] == ids[:-1]):
-        raise DataError(f"the dataset has image_id {ids[:-1][ids[1:] == ids[:-1]][0]} twice")
-    place = np.searchsorted(ids, predictions.image_id)
-    unknown = np.append(ids, -1)[place] != predictions.image_id
-    if unknown.any():
-        raise PredictionsError(
-            f"image_id {predictions.image_id[unknown].min()} is not in the dataset ({len(ids)} images, image_id "
-            f"{ids[0]} to {ids[-1]}); {np.count_nonzero(unknown)} predictions are of images that it does not have"
-        )
-    missing = np.ones(len(ids), bool)
-    missing[place] = False
-    if missing.any() and not allow_missing:
-        raise PredictionsError(
-            f"no prediction for image_id {ids[missing][0]}; {np.count_nonzero(missing)} of {len(ids)} images are "
-            "missing (`allow_missing=True` takes them as images without detections)"
-        )
-    return np.repeat(order[place], np.diff(predictions.offsets))

@@ -1,8 +1,10 @@
-"""The header of predictions files, the same in all formats."""
+"""The fields of a predictions file: of its header, of an image in JSON, and of the tables."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
+
+import msgspec
 
 from kpbench.errors import PredictionsError
 from kpbench.predictions.decode import json_type
@@ -11,6 +13,32 @@ from kpbench.types import Predictions
 SCHEMA = "kpbench.predictions/1"
 """Name and version of the format of predictions files."""
 HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
+TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
+"""Columns of CSV and Parquet; score and id are optional."""
+H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
+"""Datasets of an HDF5 file with their kind: whole (i) or any (f) numbers; score and id are optional."""
+Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
+
+
+class ImageRecord(msgspec.Struct, gc=False, forbid_unknown_fields=True):
+    """The detections in one image."""
+
+    image_id: Int64
+    keypoints: list[tuple[float, float]]
+    scores: list[float] | None = None
+    ids: list[Int64] | None = None
+
+
+EXPECTED_IN_RECORD = {
+    "ids": "a list",
+    "ids[]": "a patch id, 0 or more",
+    "image_id": "a whole number of 64 bits",
+    "keypoints": "a list",
+    "keypoints[]": "two finite numbers",
+    "scores": "a list",
+    "scores[]": "a finite number",
+}
+"""What each field of :class:`ImageRecord` must hold, in words."""
 
 
 def parse_header(content: Any) -> dict[str, Any]:
