@@ -1,5 +1,9 @@
 """Shared by all tests."""
 
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # PyTorch: the processes of pytest-xdist share the cores
+
 import pytest
 from hypothesis import settings
 

@@ -26,6 +26,7 @@ import pytest
 from click.testing import CliRunner
 
 import kpbench
+from kpbench import workers
 from kpbench.cli import main
 
 ROOT = Path(__file__).parent.parent
@@ -73,6 +74,7 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, example_data):
     blocks = [(kind, code) for kind, code in FENCE.findall(page.read_text()) if kind in ("sh", "python", "toml")]
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(workers, "count_cores", lambda: 1)  # to start processes takes longer than these few images
     monkeypatch.setenv("PATH", os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]))
     if any("photos" in code for _, code in blocks):
         (tmp_path / "photos").mkdir()
