@@ -25,8 +25,8 @@ from scipy.special import ndtr, ndtri, stdtrit
 
 from kpbench.types import Float, Int
 
-LEVEL = 0.95
-"""Probability that an interval holds the true value."""
+TAIL = 0.025
+"""Probability that the true value lies below an interval, and the same above it: the intervals are of 95 %."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
@@ -124,7 +124,7 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
     scenes : int
         Number of scenes.
     """
-    half = -stdtrit(scenes - 1, (1 - LEVEL) / 2) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
+    half = -stdtrit(scenes - 1, TAIL) * np.sqrt(scenes / (scenes - 1)) * np.array([-1.0, 1.0])
     defined = np.isfinite(without_one)
     if not len(values) or not defined.any():
         return np.asarray(ndtr(half))
