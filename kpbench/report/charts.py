@@ -12,8 +12,8 @@ from html import escape
 from typing import TypeVar
 
 CHART_COLOURS = 9
-"""Number of line colours, the classes s0 to s8. Further series take the colours again, dashed."""
-# Readable on white and on near-black, and different to colour-blind eyes; after Okabe and Ito 2008
+"""Number of line colours, which have the CSS classes s0 to s8. Further series reuse the colours with dashed lines."""
+# Colours with contrast on white and on near-black that colour-blind readers can tell apart (Okabe and Ito 2008)
 CHART_STYLE = """\
 :root{--s0:#0067a8;--s1:#c2410c;--s2:#00795a;--s3:#8d5fc4;--s4:#a16207;--s5:#be185d;--s6:#3f7f93;--s7:#5b6470;--s8:#6f4518}
 @media (prefers-color-scheme:dark){:root{--s0:#5cb3ec;--s1:#f59361;--s2:#3fc79a;--s3:#c3a2f0;--s4:#e0b13c;--s5:#f283b3;\
@@ -25,14 +25,14 @@ svg.chart{font:12px system-ui,sans-serif;color:inherit;width:100%;max-width:600p
 """ + "".join(f".s{n}{{stroke:var(--s{n});fill:var(--s{n})}}" for n in range(CHART_COLOURS))
 """Style sheet (CSS) of all charts of a page."""
 
-# Sizes and positions in units of the drawing; a browser shows a chart at most 600 px wide
+# Sizes and positions are in SVG user units; a browser shows a chart at most 600 px wide
 CHART_WIDTH, CHART_HEIGHT = 480, 300
 PLOT_LEFT, PLOT_RIGHT, PLOT_TOP, PLOT_BOTTOM = 52, 468, 10, 254
 """Edges of the plot; the labels of the axes are outside."""
 BAR_HEIGHT = 26
-"""Height of a bar with the gap to the next one."""
+"""Height of a bar, including the gap to the next bar."""
 BAR_LABEL_WIDTH = 150
-"""Width of the names left of the bars."""
+"""Width of the column of names to the left of the bars."""
 
 Value = TypeVar("Value")
 
@@ -50,7 +50,7 @@ class Series:
     interval : sequence of (low, high) or None, optional
         A band around the line; None leaves a gap.
     style : int
-        Number of the line's colour. Equal numbers in the charts of a page mean the same thing.
+        Number of the line's colour, from 0.
     dashed : bool
 
     Examples
@@ -88,9 +88,9 @@ def line_chart(
     y_range : (low, high), optional
         Default: from 0 to a little over the largest value.
     x_ticks : sequence of float, optional
-        Positions of the numbers on the x-axis; the axis holds all of them. Default: about five round numbers.
+        Positions of the numbers on the x-axis. The axis includes all positions. Default: about five round numbers.
     log_x : bool
-        Whether the x-axis is logarithmic. Then all x must be over 0.
+        Whether the x-axis is logarithmic. Then all x must be positive.
     markers : bool
         Whether each point has a dot with its numbers as a tooltip.
 
@@ -170,14 +170,14 @@ def _split_at_gaps(points: Iterable[tuple[float, Value | None]]) -> list[list[tu
 
 
 def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], styles: Sequence[int]) -> str:
-    """Draw stacked bars, each as wide as the chart.
+    """Draw stacked bars, all of the same length.
 
     Each part has a tooltip with its kind, count and share.
 
     Parameters
     ----------
     rows : sequence of (name, counts)
-        A bar's name, and a count per kind. A row of zeros has no bar.
+        The name of a bar, and one count per kind. A row of zeros has no bar.
     kinds : sequence of str
         Names of the parts of a bar.
     styles : sequence of int

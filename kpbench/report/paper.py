@@ -1,6 +1,6 @@
 """The numbers of the paper's tables (arXiv:2410.00521).
 
-The paper's suite was photographed, kpbench's is simulated. Every table that shows both says so in its header.
+The paper's suite was photographed; kpbench's suite is simulated. The title of every table with both says so.
 """
 
 from __future__ import annotations
@@ -110,13 +110,13 @@ SYNTHETIC = {
     "none": dict(zip(PAPER_METRICS, (0.985, 0.999, 0.379), strict=True)),
     "paper": dict(zip(PAPER_METRICS, (0.950, 0.993, 0.727), strict=True)),
 }
-"""The paper's table 2, the synthetic validation set, by the field `deteriorate` of :class:`kpbench.SynthConfig`."""
+"""The paper's table 2, the synthetic validation set. The keys are values of `deteriorate` in :class:`kpbench.SynthConfig`."""
 SYNTHETIC_RADIUS_PX = (5.0, 80.0)
-"""Smallest and largest radius, px, of the synthetic sets that are comparable with table 2: the defaults."""
+"""Smallest and largest radius, px, of a synthetic set that is comparable with table 2. They are the defaults."""
 
 
 def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:
-    """Return a number of the paper's tables 3 to 7, or None if they do not have it.
+    """Return a number of the paper's tables 3 to 7, or None if the tables have no such number.
 
     Examples
     --------

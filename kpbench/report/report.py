@@ -57,9 +57,9 @@ class Report:
     cases : tuple of tuples of Case
         The images to show for each run; may be empty.
     provenance : mapping
-        Versions, command, fingerprints.
+        Versions, command, digests of the predictions, fingerprint of the dataset.
     comparisons : tuple of Comparison
-        Comparisons of the first run with others; may be empty.
+        Comparisons of the first run with each other run; may be empty.
     poses : tuple of Table
         Results of :func:`kpbench.report.pose_table`; may be empty.
     title : str
@@ -88,7 +88,7 @@ class Report:
 
     @property
     def patch_names(self) -> dict[int, str]:
-        """Names of the patches by ID, as far as the config has them."""
+        """Names, by patch ID, of the patches that the config names."""
         return {int(patch["id"]): str(patch["name"]) for patch in self.config.get("patches", ())}
 
 
@@ -101,12 +101,12 @@ class Gallery:
 
 
 Block = Table | Figure | Gallery
-"""A part of a section."""
+"""A table, chart or gallery in a section."""
 
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report: a title, a sentence or two, and tables, figures or pictures."""
+    """A section of a report: a title, a short text, and tables, charts or galleries."""
 
     title: str
     lead: str
@@ -134,8 +134,9 @@ def _overview_section(report: Report) -> Section:
     runs, settings = report.runs, report.runs[0].settings
     return Section(
         "Overview",
-        f"A detection can match a keypoint at a distance of at most {settings.eps:g} of the keypoint's "
-        f"{settings.eps_radius} radius ({settings.matching}). Brackets hold 95 % intervals from resampled scenes.",
+        f"A detection can match a keypoint at a distance of at most {settings.eps:g} radii ({settings.eps_radius} "
+        f"semi-axis): the matching threshold. Matching is {settings.matching}. "
+        "All intervals are 95 % intervals from resampled scenes.",
         (overview_table(runs), count_table(runs), *taxonomy_charts(runs)),
     )
 
@@ -143,7 +144,7 @@ def _overview_section(report: Report) -> Section:
 def _comparison_section(report: Report) -> Section:
     comparisons = report.comparisons
     tables = [verdict_table(comparisons), *map(difference_table, comparisons)] if comparisons else []
-    return Section("Compared", "Differences are paired: the same scenes are resampled for both.", tuple(tables))
+    return Section("Compared", "Differences are paired: each resample draws the same scenes for both detectors.", tuple(tables))
 
 
 def _paper_section(report: Report) -> Section:
@@ -155,8 +156,8 @@ def _paper_section(report: Report) -> Section:
         tables.append(synthetic_table(report.runs, deteriorate))
     return Section(
         "Beside the paper",
-        "The paper's photographs are not public. Its numbers and ours are of different images and different prints, "
-        "so the shapes of the curves can be compared, but not the digits.",
+        "The paper's photographs are not public. The paper's numbers and ours come from different images and different "
+        "prints. Compare the shapes of the curves, not the values.",
         tuple(tables),
     )
 
@@ -167,13 +168,13 @@ def _severity_section(report: Report) -> Section:
     charts = [severity_chart(runs, name, metric) for name in conditions for metric in metrics]
     others = [condition_table(runs, name) for name in conditions if name not in PAPER]
     blocks: list[Block] = [breakpoint_table(runs), *charts, *others] if conditions else []
-    return Section("Severity", "Each condition over its rungs, all patches together.", tuple(blocks))
+    return Section("Severity", "Metrics at each rung of each condition, over all patches.", tuple(blocks))
 
 
 def _precision_recall_section(report: Report) -> Section:
     return Section(
         "Precision and recall",
-        "Precision and recall at every threshold on the score; detection score at every largest distance of a match.",
+        "Precision and recall at every score threshold; detection score against the matching threshold.",
         (precision_recall_chart(report.runs), eps_chart(report.runs)),
     )
 
@@ -185,18 +186,20 @@ def _radius_section(report: Report) -> Section:
     if bins[0][1]:
         charts = (radius_chart(runs, "error_median_px"), radius_chart(runs, "detection_score"))
         blocks = (*charts, *(group_table(groups, f"By radius: {run.name}") for run, groups in bins))
-    lead = "Only matches have errors, so no error exceeds the largest distance of a match."
+    lead = "Only matches have errors, so no error exceeds the matching threshold."
     return Section("Localisation by radius", lead, blocks)
 
 
 def _pose_section(report: Report) -> Section:
-    return Section("Pose", "The board's pose from the matched detections, by solvePnP.", report.poses)
+    lead = "Errors of the board's pose. solvePnP estimates the pose from the matched detections."
+    return Section("Pose", lead, report.poses)
 
 
 def _identity_section(report: Report) -> Section:
     return Section(
         "Identities",
-        "Matched detections: true ID in rows, detected ID in columns; other is an ID that no true keypoint has.",
+        "Matched detections, with true IDs in rows and detected IDs in columns. The column \"other\" counts IDs that no "
+        "true keypoint has, and detections that give two IDs to one place.",
         tuple(confusion_table(run, report.patch_names) for run in report.runs if run.confusion),
     )
 
@@ -205,8 +208,8 @@ def _worst_cases_section(report: Report) -> Section:
     galleries = (Gallery(run.name, cases) for run, cases in zip(report.runs, report.cases, strict=True))
     return Section(
         "Worst cases",
-        "The images with most failures, about as many of each condition. Ellipses are true keypoints, crosses are "
-        "detections, numbers are IDs.",
+        "The images with the most failures, up to the same number of images per condition. Ellipses are true keypoints, "
+        "crosses are detections, numbers are detected IDs.",
         tuple(galleries) if report.cases else (),
     )
 
@@ -214,7 +217,7 @@ def _worst_cases_section(report: Report) -> Section:
 def _all_groups_section(report: Report) -> Section:
     listed = [(run, [g for g in run.by if g.key.radius_px is None]) for run in report.runs]
     tables = tuple(group_table(groups, run.name, report.patch_names) for run, groups in listed if groups)
-    return Section("All groups", "Everything by condition, rung and patch.", tables)
+    return Section("All groups", "The metrics of each condition, rung and patch.", tables)
 
 
 def _conditions(report: Report) -> list[str]:
@@ -238,22 +241,21 @@ def to_latex_report(report: Report) -> str:
 def _render_text(
     report: Report,
     to_text: Callable[[Table], str],
-    title: str,
-    section_title: str,
+    title_template: str,
+    section_template: str,
     format_prose: Callable[[str], str],
-    provenance: str | None,
+    provenance_template: str | None,
 ) -> str:
     """Render a report as plain text.
 
-    ``title``, ``section_title`` and ``provenance`` are templates with one ``{}``. A ``provenance`` of None renders the
-    provenance as prose.
+    Each template contains one ``{}``. If ``provenance_template`` is None, ``format_prose`` formats the provenance.
     """
-    parts = [title.format(report.title), format_prose(_describe_images(report))]
+    parts = [title_template.format(report.title), format_prose(_describe_images(report))]
     for section in make_sections(replace(report, cases=())):
-        parts += [section_title.format(section.title), format_prose(section.lead)]
+        parts += [section_template.format(section.title), format_prose(section.lead)]
         parts += [to_text(block) for block in section.blocks if isinstance(block, Table)]
     content = json.dumps(report.provenance, indent=1)
-    parts.append(format_prose(content) if provenance is None else provenance.format(content))
+    parts.append(format_prose(content) if provenance_template is None else provenance_template.format(content))
     return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
 
@@ -291,13 +293,13 @@ def to_html(report: Report) -> str:
 
 
 def _sort_key(cell: Cell) -> str:
-    """Return the text by which a browser sorts the cell: the number without its interval, "" for undefined."""
+    """Return the text by which a browser sorts the cell: the number without its interval, or "" if undefined."""
     value = cell.value if isinstance(cell, Estimate) else cell
     return "" if value is None else str(value)
 
 
 def _share(row: Sequence[Cell], cell: Cell) -> int:
-    """Return the percentage of a count in the sum of its row."""
+    """Return a count as a percentage of the sum of its row; 0 for a cell that is no count."""
     total = sum(c for c in row if isinstance(c, int))
     return round(100 * cell / total) if isinstance(cell, int) and total else 0
 
@@ -307,7 +309,7 @@ REPORT_WRITERS: dict[str, Callable[[Report], str]] = {
     ".md": to_markdown_report,
     ".tex": to_latex_report,
 }
-"""The function that renders a report, by the suffix of its file."""
+"""For each file suffix, the function that renders a report."""
 
 
 def write_report(path: str | Path, report: Report) -> None:
@@ -322,7 +324,7 @@ def write_report(path: str | Path, report: Report) -> None:
     Raises
     ------
     DataError
-        If the suffix is another or the file cannot be written.
+        If the path does not end in .html, .md or .tex, or the file cannot be written.
 
     Examples
     --------
@@ -336,12 +338,12 @@ def write_report(path: str | Path, report: Report) -> None:
 
 
 def require_report_suffix(path: Path) -> None:
-    """Refuse a path whose suffix is that of no report.
+    """Refuse a path that does not end in .html, .md or .tex.
 
     Raises
     ------
     DataError
-        If the suffix is another than .html, .md and .tex.
+        If the path has another suffix or none.
     """
     if path.suffix.lower() not in REPORT_WRITERS:
         raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_WRITERS)}")

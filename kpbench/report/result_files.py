@@ -26,9 +26,9 @@ COMPARISON_SCHEMA = "kpbench.comparison/1"
 def collect_provenance(
     dataset: Path, fingerprint: str, predictions: Sequence[Path], command: Sequence[str]
 ) -> dict[str, Any]:
-    """Collect what numbers were made from: the predictions files with their SHA-256, the dataset, versions.
+    """Collect the provenance of scores: predictions files with their SHA-256, dataset, command and versions.
 
-    Time and machine are left out. So the same input gives the same bytes.
+    Time and machine are left out, so that the same input gives the same bytes.
     """
     return {
         "kpbench": __version__,
@@ -58,9 +58,9 @@ def _encode_json(content: Mapping[str, Any]) -> bytes:
 
 
 def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
-    """Encode scores as CSV, one row per group, the first overall.
+    """Encode scores as CSV, one row per group. The first row is over all images.
 
-    Each row names detector, dataset and version of kpbench, so that tables can be joined.
+    Each row names the detector, the dataset and the version of kpbench, so that tables can be joined.
     """
     about = {"detector": scores.name, "dataset": scores.fingerprint, "kpbench": provenance["kpbench"]}
     rows = [about | row for row in scores.rows()]

@@ -41,7 +41,9 @@ class Figure:
 
 
 def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detection_score") -> Figure:
-    """Draw a metric over the rungs of a condition: a line per detector with its 95 % band, the paper's line dashed.
+    """Draw a metric over the rungs of a condition.
+
+    Each detector has a line with a 95 % band. The paper's line is dashed.
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detect
 
 
 def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
-    """Draw precision over recall at all thresholds on the score."""
+    """Draw precision over recall at all score thresholds."""
     series = []
     for n, run in enumerate(runs):
         recall = [0.0 if r is None else r for r in run.curve["recall"]]
@@ -93,7 +95,7 @@ def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
 
 
 def eps_chart(runs: Sequence[Scores]) -> Figure:
-    """Draw the detection score over the largest distance of a match, ε."""
+    """Draw the detection score over the matching threshold ε."""
     series = [
         Series(run.name, [e or 0.0 for e in run.eps_curve["eps"]], run.eps_curve["detection_score"], style=n)
         for n, run in enumerate(runs)
@@ -105,7 +107,11 @@ def eps_chart(runs: Sequence[Scores]) -> Figure:
 
 
 def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
-    """Draw a metric over the radius of the true keypoints' discs. The point of a bin is midway between its edges."""
+    """Draw a metric over the radius of the true keypoints' discs.
+
+    The point of a bin is midway between its edges. The last bin has no upper edge, so its point is at 1.5 times the
+    lower edge.
+    """
     series = []
     for n, run in enumerate(runs):
         bins = [(g, *g.key.radius_px) for g in run.by if g.key.radius_px is not None]
@@ -125,7 +131,7 @@ def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
 
 
 def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:
-    """Draw the shares of the outcomes of true keypoints, and of detections: a bar per detector."""
+    """Draw two charts, the outcomes of true keypoints and the outcomes of detections, with one bar per detector."""
     keypoints: tuple[str, ...] = ("found with the right ID", "found with a wrong ID", "missed")
     if any(run.overall.counts["id_correct"] is None for run in runs):
         keypoints = ("found", "missed")

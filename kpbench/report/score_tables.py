@@ -15,11 +15,11 @@ from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
 
 SHORT_LABELS = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
-"""The paper's metrics in narrow columns."""
+"""Labels of the paper's metrics in narrow columns."""
 
 
 def get_estimate(group: Group | None, metric: str) -> Estimate | None:
-    """Return a metric of a group with its interval; None for a group of None."""
+    """Return a metric of a group with its interval, or None if the group is None."""
     return None if group is None else Estimate(group.metrics[metric], group.intervals.get(metric))
 
 
@@ -44,7 +44,7 @@ def overview_table(runs: Sequence[Scores]) -> Table:
 
 
 def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simulated") -> Table:
-    """Set detectors below the rows of one of the paper's tables, with one column per rung.
+    """Tabulate the metrics of the paper and of detectors for one of the paper's tables, with one column per rung.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
     table : PaperTable
         One of :data:`kpbench.report.PAPER`.
     images : str
-        How the images of the detectors were made; it stands beside their rows.
+        How the detectors' images were made. The detectors' rows show this text.
 
     Examples
     --------
@@ -83,7 +83,7 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
 
 
 def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate | None:
-    """Return an estimate less the paper's value. The paper gives no intervals, so the width of the interval stays."""
+    """Return an estimate minus the paper's value. The paper gives no intervals, so the interval keeps its width."""
     if estimate is None or estimate.value is None or paper is None:
         return None
     interval = estimate.interval
@@ -91,7 +91,7 @@ def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate 
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
-    """Set detectors below the rows of the paper's table 2, in the column of ``deteriorate`` ("none" or "paper")."""
+    """Tabulate the paper's table 2, with the detectors' metrics in the column of ``deteriorate`` ("none" or "paper")."""
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
         rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
@@ -102,7 +102,7 @@ def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
         "Synthetic validation set (paper: its own simulation; ours: simulated)",
         ("metric", "detector", "images", "without deterioration", "with deterioration"),
         tuple(rows),
-        "Paper: table 2 of arXiv:2410.00521. Its images are not ours.",
+        "Paper: table 2 of arXiv:2410.00521. The paper's images are not ours.",
     )
 
 
@@ -140,7 +140,8 @@ def breakpoint_table(runs: Sequence[Scores], limit: float = DETECTION_SCORE_LIMI
         f"Where the detection score crosses {limit:g}",
         ("detector", *names),
         tuple(rows),
-        "On straight lines between the rungs; 95 % intervals from resampled scenes, cut at the ends of the ladder.",
+        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes, limited to "
+        "the range of the rungs.",
     )
 
 
@@ -159,8 +160,8 @@ def group_table(
 ) -> Table:
     """Tabulate the main metrics of groups, one row per group.
 
-    Condition, rung, patch and radius have a column if some group has one. The paper's formulas as printed have a column
-    if they differ from the metrics of one-to-one matching in some group.
+    Condition, rung, patch and radius each have a column if some group is limited to a value. Each of the paper's
+    formulas as printed has a column if, in some group, its value differs from the metric of one-to-one matching.
 
     Parameters
     ----------
@@ -232,7 +233,7 @@ def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
 
 
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:
-    """Tabulate the differences over all images and the verdicts over the rungs: a row per rival and metric.
+    """Tabulate differences over all images and counts of verdicts over rungs: a row per other detector and metric.
 
     Examples
     --------
@@ -251,14 +252,14 @@ def verdict_table(comparisons: Sequence[Comparison]) -> Table:
     name = comparisons[0].first
     columns = ("against", "metric", name, "the other", "difference", "over all images", "rungs better", "even", "worse")
     note = (
-        "A difference is called better or worse when its paired 95 % interval leaves out 0. Where nothing differs, "
-        "about 5 rungs in 100 are called so by chance."
+        "A difference is called better or worse when its paired 95 % interval does not contain 0. Between equal "
+        "detectors, chance makes about 5 rungs in 100 better or worse."
     )
     return Table(f"{name} against the others", columns, tuple(rows), note)
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Tabulate first minus second: all images, then a row per condition and rung.
+    """Tabulate first minus second: a row for all images, then a row per condition and rung.
 
     Examples
     --------
@@ -277,7 +278,7 @@ def difference_table(comparison: Comparison) -> Table:
 
 
 def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
-    """Tabulate errors of the board's pose: all images, then a row per condition and rung.
+    """Tabulate errors of the board's pose: a row for all images, then a row per condition and rung.
 
     Parameters
     ----------
@@ -301,5 +302,5 @@ def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
     percentiles = ("median", "95th percentile")
     errors = [f"{error}, {percentile}" for error in ("translation (%)", "rotation (°)") for percentile in percentiles]
     columns = ("condition", "rung", "images", "with a pose", *errors)
-    note = "From at least four matched keypoints per image; translation in % of the distance of board and camera."
+    note = "A pose needs at least four matched keypoints. Translation is in % of the board's distance from the camera."
     return Table(f"Pose of the board: {run.name}", columns, tuple(rows), note)

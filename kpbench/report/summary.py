@@ -1,4 +1,4 @@
-"""Scores and comparisons as plain text, for a terminal."""
+"""Write scores and comparisons as plain text, for a terminal."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from kpbench.scoring.scores import Scores
 def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
     """Write the settings, counts and metrics of a detector, and its tables of IDs, groups and poses.
 
-    The paper's formulas as printed are left out where they give the same numbers in all groups.
+    A formula of the paper as printed is left out if it agrees with one-to-one matching in all groups.
 
     Parameters
     ----------
@@ -28,14 +28,14 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
     >>> import kpbench
     >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
     >>> print(kpbench.report.summarise_scores(scores).splitlines()[0])
-    match        at most 0.1 of the major radius, one-to-one
+    match        at most 0.1 radii (major semi-axis), one-to-one
     """
     overall, settings = scores.overall, scores.settings
     groups = (overall, *scores.by)
     hidden = {f"{m}_literal" for m in PAPER_METRICS if all(g.metrics[m] == g.metrics[f"{m}_literal"] for g in groups)}
     n = {name: cell_text(value) for name, value in overall.counts.items()}
     lines = [
-        f"match        at most {settings.eps:g} of the {settings.eps_radius} radius, {settings.matching}",
+        f"match        at most {settings.eps:g} radii ({settings.eps_radius} semi-axis), {settings.matching}",
         f"images       {n['images']} in {n['scenes']} scenes, which the 95 % intervals resample",
         f"keypoints    {n['truths']}: {n['matched']} matched ({n['wrong_id']} with a wrong ID), {n['missed']} missed",
         f"detections   {n['detections']}: {n['matched']} matched, {n['duplicate']} duplicates, "
@@ -59,7 +59,7 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
 
 
 def summarise_comparisons(comparisons: Sequence[Comparison]) -> str:
-    """Write the verdicts of the first detector against each other one, and all differences.
+    """Write the verdicts on the first detector against each of the others, and all differences.
 
     Examples
     --------

@@ -10,7 +10,7 @@ from kpbench.scoring.bootstrap import Interval
 
 
 class Estimate(NamedTuple):
-    """A number with its 95 % interval; None where the number is undefined or has no interval.
+    """A number with its 95 % interval. An undefined number or interval is None.
 
     Examples
     --------
@@ -36,11 +36,11 @@ class Table:
     title : str
     columns : tuple of str
     rows : tuple of tuples of Cell
-        An int is written as it is, a float with three decimals or four if it is small, None as n/a.
+        A float is written with three decimals (four below 0.01), None as n/a.
     note : str
-        A sentence for below the table.
+        Text below the table.
     shade : bool
-        Whether a page may shade each count by its share of the row.
+        Whether a page shades each count by its share of the row's sum.
 
     Examples
     --------
@@ -60,7 +60,10 @@ class Table:
 
 
 def cell_text(cell: Cell, digits: int = 3) -> str:
-    """Write a cell with ``digits`` decimals, an estimate as ``0.882 [0.861, 0.901]``."""
+    """Write a float with ``digits`` decimals, an estimate as ``0.882 [0.861, 0.901]``, and None as n/a.
+
+    If ``digits`` is under 4, a nonzero float below 0.01 gets one decimal more.
+    """
     if cell is None:
         return "n/a"
     if isinstance(cell, Estimate):
@@ -111,13 +114,13 @@ def to_markdown(table: Table) -> str:
 LATEX_OF = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "ε": r"$\varepsilon$"} | {
     c: f"\\{c}" for c in "&%$#_{}"
 }
-"""LaTeX of the characters that LaTeX does not print as they are."""
+"""LaTeX commands for the characters that LaTeX does not print literally."""
 
 
 def to_latex(table: Table) -> str:
-    r"""Write a ``table`` environment with a ``tabular`` that needs no package.
+    r"""Write a LaTeX ``table`` environment that needs no package.
 
-    The first column is aligned to the left, all others to the right.
+    The first column is aligned to the left, all other columns to the right.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Pick the images on which a detector fails worst, with truth and detections as marks to draw over them."""
+"""Pick the images on which a detector fails most, with marks for the true keypoints and the detections."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ JPEG_QUALITY = 82
 """Quality of a picture in the gallery, of 100."""
 NAME_OF_KIND = {MATCHED: "matched", DUPLICATE: "duplicate", NEAR_MISS: "near miss", CLUTTER: "clutter"}
 FAILURES = ("missed", "wrong ID", "duplicate", "near miss", "clutter")
-"""Names of what can be wrong in an image."""
+"""Names of the failures that are counted in an image."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Mark:
     Attributes
     ----------
     x, y : float
-        Place, px of the whole image.
+        Place in the whole image, px.
     kind : str
-        Of a true keypoint: "matched", "wrong ID" or "missed". Of a detection: "matched", "wrong ID", "duplicate",
+        For a true keypoint: "matched", "wrong ID" or "missed". For a detection: "matched", "wrong ID", "duplicate",
         "near miss" or "clutter".
     label : str
         Identity, "" if unknown.
@@ -58,7 +58,7 @@ class Mark:
 
 @dataclass(frozen=True)
 class Case:
-    """An image with failures, cut to the part that holds all marks.
+    """An image with failures, cropped to a box around all marks.
 
     Attributes
     ----------
@@ -92,13 +92,15 @@ class Case:
 
 
 def pick_worst_cases(outcomes: Outcomes, image: Callable[[int], UInt8], count: int = 12) -> tuple[Case, ...]:
-    """Pick the images with most failures, worst first, about as many of each condition.
+    """Pick the images with the most failures, worst first.
+
+    Each condition has at most ``count`` / (number of conditions) images, rounded up.
 
     Parameters
     ----------
     outcomes : Outcomes
     image : function
-        Reads the image at a position of the truth, uint8 of shape (H, W) or (H, W, 3) RGB.
+        Function that reads the image at a position in the truth, uint8 of shape (H, W) or (H, W, 3) RGB.
     count : int
         Largest number of images. Images without failures are not picked.
 
@@ -138,7 +140,7 @@ def _make_case(outcomes: Outcomes, k: int, image: UInt8) -> Case:
     is_correct = {int(outcomes.matches.detection[t]): bool(outcomes.correct[t]) for t in keypoints}
     truth = tuple(_mark_of_truth(outcomes, t) for t in keypoints)
     detections = tuple(_mark_of_detection(outcomes, d, is_correct.get(d, True)) for d in found)
-    # A wrong ID marks both the keypoint and its detection, and counts once
+    # A wrong ID marks both the keypoint and its detection, but counts once
     kinds = [mark.kind for mark in truth] + [mark.kind for mark in detections if mark.kind != "wrong ID"]
     left, top, width, height = box = _box_around((*truth, *detections), image.shape[1], image.shape[0])
     return Case(
@@ -178,7 +180,7 @@ def _mark_of_detection(outcomes: Outcomes, d: int, is_correct: bool) -> Mark:
 def _box_around(marks: tuple[Mark, ...], width: int, height: int) -> tuple[int, int, int, int]:
     """Return the part of an image that holds all marks: left, top, width, height.
 
-    It has the proportions of the image, and at least a quarter of the image's sides.
+    The part has the proportions of the image. Its sides are at least a quarter of the image's sides.
     """
     margin = [3 * m.axes[0] if m.axes else 0.0 for m in marks]
     x, y = (np.array([getattr(m, axis) for m in marks]) for axis in ("x", "y"))
