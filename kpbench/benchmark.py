@@ -1,9 +1,9 @@
-"""Run detectors over benchmark suites and score them; keep all finished work, so that an interrupted run goes on.
+"""Run detectors over benchmark suites and score them; keep all finished work, so that an interrupted run can resume.
 
-Everything lies in one folder. The name of a dataset's folder holds a digest of its config. The name of a predictions
-file holds the dataset's fingerprint and a digest of the detector's version, settings and weights. So files of other
-inputs have other names, and a file that exists is always valid. A detector without a version runs again at each call.
-Scoring takes seconds and is repeated at each call.
+All results lie in one folder. The name of a dataset's folder contains a digest of the config and of kpbench's version.
+The path of a predictions file contains digests of the dataset and of the detector's version, settings and weights.
+So other inputs have other paths, and a file that exists is always valid. A detector without a version runs again at
+each call. Scoring takes seconds and is repeated at each call.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class SuiteReport:
     suite : str
         Name of the suite.
     tables : tuple of Table
-        The detectors over all images, the paper's tables with the detectors below, and the breakpoints.
+        The main metrics over all images, the paper's tables with rows for the detectors, and the breakpoints.
     page : Path
         The report, HTML.
     scores_folder : Path
@@ -108,7 +108,7 @@ class SuiteReport:
 class _Part:
     """A job: run a detector over some images of a dataset, and keep its detections in a file.
 
-    ``description`` is the detector's name and version, ``first`` a position in the dataset.
+    ``description`` holds the detector's name and version. ``first`` is the position of the first image in the dataset.
     """
 
     dataset: Path
@@ -207,7 +207,7 @@ def _make_dataset(config: SuiteConfig, folder: Path, workers: int | None, progre
 
 
 def _digest_detector(detector: LoadedDetector) -> str:
-    """Return a digest of a detector and of the designs that it looks for."""
+    """Return a digest of a detector and of all shipped patch designs."""
     parts = [detector.name, detector.identity, *(patch.digest for patch in shipped_patches())]
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
@@ -223,7 +223,7 @@ def _parts_folder(file: Path) -> Path:
 
 
 def _plan_parts(dataset: Dataset, detector: str, description: dict[str, Any], file: Path) -> list[_Part]:
-    """Return the parts of a predictions file, and make the folder that holds them until they are joined."""
+    """Return the parts of a predictions file, and make the folder for the files of the parts."""
     folder = make_folder(_parts_folder(file))
     return [
         _Part(
@@ -290,7 +290,7 @@ def _score_run(config: SuiteConfig, dataset: Dataset, file: Path) -> BenchRun:
 def write_suite_reports(
     runs: Iterable[BenchRun], out: str | Path, *, command: Sequence[str] = ()
 ) -> tuple[SuiteReport, ...]:
-    """Write a report per suite and a scores file per detector, and return their tables.
+    """Write a report per suite, and a scores file per suite and detector.
 
     Parameters
     ----------

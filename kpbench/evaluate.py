@@ -28,13 +28,13 @@ from kpbench.scoring.scores import Scores, score
 from kpbench.types import Predictions, Truth, UInt8
 
 DEFAULT_DATASET = Path("kpbench-data")
-"""The folder that ``kpbench synth`` writes by default. It is the truth where neither user nor file names a dataset."""
+"""The folder that ``kpbench synth`` writes by default. Scoring uses it if neither user nor file names a dataset here."""
 MOST_CASES = 12
-"""Number of images in a report's gallery of failures, shared by its detectors."""
+"""Number of failures to show in a report, divided among its detectors."""
 
 
 class LabelledImages(Protocol):
-    """A dataset as scoring and reports need it: :class:`kpbench.Dataset`, COCO annotations, or a class of yours.
+    """What scoring and reports use of a dataset: a :class:`kpbench.Dataset`, COCO annotations or your own class.
 
     Examples
     --------
@@ -96,7 +96,7 @@ class ScoredFile:
     dataset : LabelledImages
         The dataset that the predictions were scored against.
     poses : tuple of PoseGroup
-        Errors of the board's pose; empty unless `pose` was set.
+        Errors of the board's pose; empty if `pose` was False.
     provenance : dict
         Files, digests and versions behind the numbers.
 
@@ -121,7 +121,7 @@ class ComparedFiles:
     Attributes
     ----------
     comparisons : tuple of Comparison
-        The first file against each of the others.
+        Comparisons of the first file with each of the others.
     scores : tuple of Scores
         The scores of each file.
     dataset : LabelledImages
@@ -133,7 +133,7 @@ class ComparedFiles:
     --------
     >>> import kpbench
     >>> compared = kpbench.compare_files(["preds.json", "preds.json"])
-    >>> [scores.name for scores in compared.scores]  # the file tells detectors of equal names apart
+    >>> [scores.name for scores in compared.scores]  # file names tell the two detectors apart
     ['oracle preds.json', 'oracle preds.json']
     """
 
@@ -165,13 +165,13 @@ def score_file(
         Folder of a dataset, COCO annotations (.json) or an open dataset. None takes the dataset that the predictions
         name, else the folder ``kpbench-data``.
     pose : bool
-        Whether to compute errors of the board's pose too. The dataset must be that of a suite.
+        Whether to compute errors of the board's pose too. The dataset must be made from a suite.
     json_file, csv_file, report_file : str, Path or None
-        Files to write: all scores, one row per group, and a report (.html, .md or .tex).
+        Files to write: all scores as JSON, one row per group as CSV, and a report (.html, .md or .tex).
     command : sequence of str
         The command line, for the provenance.
     warn : function
-        Called with a line of text if the images for the report, or the dataset that the predictions name, are missing.
+        Called with a line of text if the images for the report or the dataset that the predictions name are missing.
     **options
         The keyword arguments of :func:`kpbench.score`, such as ``eps=0.2``.
 
@@ -184,7 +184,7 @@ def score_file(
     PredictionsError
         If the predictions cannot be read or do not fit the dataset.
     DataError
-        If the dataset cannot be read, `pose` is set and the dataset shows no board, or a file cannot be written.
+        If the dataset cannot be read, a file cannot be written, or `pose` is set and the dataset shows no known board.
 
     Examples
     --------
@@ -226,7 +226,7 @@ def compare_files(
     truth, command, warn, **options
         As for :func:`score_file`. None as `truth` takes the dataset that the first file names.
     json_file, report_file : str, Path or None
-        Files to write: all differences, and a report (.html, .md or .tex).
+        Files to write: all differences as JSON, and a report (.html, .md or .tex).
 
     Returns
     -------
@@ -279,7 +279,7 @@ def _score_files(
 ) -> tuple[LabelledImages, list[Scores]]:
     """Score all files against the dataset of the first file.
 
-    Detectors of equal names get the names of their files too.
+    If detectors share a name, the names of their files are appended.
     """
     predictions = [read_predictions(path) for path in files]
     dataset = _find_dataset(predictions[0], files[0], truth, warn)
@@ -312,13 +312,13 @@ def _find_dataset(
     problem = f"names the dataset {named!r}, which is not here" if named else "names no dataset"
     if not DEFAULT_DATASET.exists():
         raise PredictionsError(f"{file}: {problem}, and there is no ./{DEFAULT_DATASET}; name one with `truth`")
-    if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint is no path, so nothing is missing
+    if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint names no folder that could be missing
         warn(f"{file} {problem}; scoring against ./{DEFAULT_DATASET}")
     return open_dataset(DEFAULT_DATASET)
 
 
 def _compute_poses(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
-    from kpbench.synth.suite import board_in_view  # here, because few need it and it loads OpenCV
+    from kpbench.synth.suite import board_in_view  # imported here, because few runs need it and it loads OpenCV
 
     view = board_in_view(dataset.config)
     if view is None:
@@ -335,7 +335,7 @@ def _write_report(
     comparisons: Sequence[Comparison] = (),
     poses: Sequence[PoseGroup] = (),
 ) -> None:
-    from kpbench.report.worst_cases import Case, pick_worst_cases  # here, because it loads OpenCV
+    from kpbench.report.worst_cases import Case, pick_worst_cases  # imported here, because it loads OpenCV
 
     cases: tuple[tuple[Case, ...], ...] = ()
     if path.suffix.lower() == ".html":

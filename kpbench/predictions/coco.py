@@ -23,7 +23,7 @@ Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]
 """Number of a category: a patch ID plus 1."""
 Point = tuple[float, float, float]
-"""Place x, y in px, and COCO's visibility v; v = 0 is "not labelled"."""
+"""Place x, y in px, and COCO's visibility v; v = 0 means "not labelled"."""
 
 
 class CocoImage(msgspec.Struct, gc=False):
@@ -37,7 +37,7 @@ class CocoImage(msgspec.Struct, gc=False):
 
 
 class CocoAnnotation(msgspec.Struct, gc=False):
-    """An entry of ``annotations``: a keypoint with the radius of its disc. The radii are kpbench's additions."""
+    """An entry of ``annotations``: a keypoint with its disc. The fields from ``radius`` on are kpbench's additions."""
 
     image_id: Whole
     category_id: Category
@@ -88,7 +88,7 @@ EXPECTED_IN_COCO = {
     "score": "a finite number",
     "visible": "a fraction",
 }
-"""What each field of the records above must hold, in words."""
+"""The expected value of each field of the records above, in words."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class CocoDataset:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the dataset that was exported; without one the SHA-256 of the annotations file."""
+        """Fingerprint that the annotations file names, else the SHA-256 of the annotations file."""
         return self.truth.fingerprint
 
     @property
@@ -148,7 +148,7 @@ def open_coco(path: str | Path) -> CocoDataset:
     """Read true keypoints from a COCO annotations file.
 
     Each annotation has one keypoint ``[x, y, v]`` and its radius in px: ``radius``, or ``radius_major`` and
-    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` less 1, as
+    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` minus 1, as
     :func:`kpbench.export_dataset` numbers the categories. Images may have a ``condition`` (text), a ``rung`` (number)
     and a ``scene_id`` (whole number).
 
@@ -163,7 +163,7 @@ def open_coco(path: str | Path) -> CocoDataset:
     Raises
     ------
     DataError
-        If the file cannot be read. One line names the file, the entry in it and what was expected.
+        If the file cannot be read. The message names the file, the faulty entry and the expected value.
 
     Examples
     --------
@@ -181,7 +181,7 @@ def open_coco(path: str | Path) -> CocoDataset:
             content = _decode_annotations(data)
             truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
             files = tuple(image.file_name for image in content.images)
-            del content  # freed before the collector would walk through it
+            del content  # freed before the garbage collector resumes and scans it
         return CocoDataset(path, truth, files)
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {error.strerror}") from None
@@ -193,7 +193,7 @@ def _decode_annotations(data: bytes) -> CocoAnnotations:
     try:
         return msgspec.json.decode(data, type=CocoAnnotations)
     except (ValueError, RecursionError):
-        content = parse_json(data, "the file")  # a second time, to find the place of the fault
+        content = parse_json(data, "the file")  # decoded again, to find the place of the fault
     if not isinstance(content, dict):
         raise DataError(f"holds {json_type(content)}, expected COCO annotations") from None
     for name in ("images", "annotations"):
@@ -263,7 +263,7 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
 
 
 def _column(entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: type = np.float64) -> NDArray[Any]:
-    """Return a field of all entries; nan for None."""
+    """Return a field of all entries. None becomes nan."""
     values = map(attrgetter(name), entries)
     try:
         return np.fromiter(values, kind, len(entries))
@@ -280,13 +280,13 @@ def _points(entries: Sequence[CocoAnnotation | CocoResult]) -> NDArray[np.float6
 def decode_coco_results(data: bytes) -> Predictions:
     """Decode COCO keypoint results, ``[{"image_id", "category_id", "keypoints": [x, y, v], "score"}, …]``.
 
-    Each entry is a detection with one keypoint, whose visibility v is ignored. Its patch ID is the category ID less 1,
-    as :func:`kpbench.export_dataset` numbers the categories. Results cannot name images without detections.
+    Each entry is a detection with one keypoint. The visibility v is ignored. The patch ID is the category ID minus 1,
+    as :func:`kpbench.export_dataset` numbers the categories. Results do not list images without detections.
 
     Raises
     ------
     PredictionsError
-        At the first entry with a fault; the message names its image.
+        At the first entry with a fault. The message names the entry and the image.
     """
 
     def place(n: int) -> str:
@@ -297,7 +297,7 @@ def decode_coco_results(data: bytes) -> Predictions:
         if frame != []:
             raise ValueError
         parts = [_to_columns(batch) for batch in decode_records(pieces, CocoResult, EXPECTED_IN_COCO, place)]
-    except (ValueError, RecursionError):  # entries may hold objects: decode at once, which finds a fault's place too
+    except (ValueError, RecursionError):  # entries with objects cannot be split: decode all at once, and find any fault
         entries = parse_json(data, "the file")
         if not isinstance(entries, list):
             raise PredictionsError(f"holds {json_type(entries)}, expected a list of COCO keypoint results") from None

@@ -1,7 +1,7 @@
 """Decode JSON into typed records, a part of a long list at a time, and describe the first fault in one line.
 
-Decoding into typed records skips unknown fields and makes no dictionaries. Only a file with a fault is decoded a second
-time, into plain objects, to find the place of the fault.
+Decoding into typed records makes no dictionaries. A file is decoded again, into plain objects, only if it has a fault
+or its list cannot be split. The second decoding finds the place of the fault.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ PIECE_BYTES = 4 * 2**20
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Expected = Mapping[str, str]
-"""What each field of a record must hold, in words. ``NAME[]`` describes the entries of a list."""
+"""The expected value of each field of a record, in words. ``NAME[]`` describes the entries of the list ``NAME``."""
 Place = Callable[[int], str]
 """A function that names the n-th record of a file, such as ``predictions[12]``."""
 
@@ -31,25 +31,26 @@ def split_list(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
     """Split the long list of a JSON text into shorter lists.
 
     Decoded at once, the list would take several times the memory of its text. The split is at closing braces, so the
-    records of the list must not contain objects. The list must be the last one of the text.
+    records of the list must not contain objects. No other list may follow in the text.
 
     Parameters
     ----------
     data : bytes
     opening : str
-        Regular expression for the text before the list, with the opening bracket of the list.
+        Regular expression for the text that ends with the opening bracket of the list.
 
     Returns
     -------
     frame : decoded JSON
-        The text with an empty list in place of the long one.
+        The text with an empty list in place of the long list; the whole text if ``opening`` is not found.
     pieces : iterator of bytes
-        The shorter lists, as JSON. It raises ValueError where the list cannot be split.
+        The shorter lists, as JSON; none if ``opening`` is not found. Iteration raises ValueError where the list cannot
+        be split.
 
     Raises
     ------
     ValueError
-        If the text does not begin like this, or the frame is not JSON.
+        If the frame is not JSON.
     """
     found = re.search(opening.encode(), data)
     start, stop = (found.end(), data.rfind(b"]")) if found else (0, 0)
@@ -168,7 +169,7 @@ def abbreviate(value: object) -> str:
 
 @contextmanager
 def pause_gc() -> Iterator[None]:
-    """Pause the garbage collector. It would walk through millions of new objects many times."""
+    """Pause the garbage collector, which would scan millions of new objects many times."""
     running = gc.isenabled()
     gc.disable()
     try:

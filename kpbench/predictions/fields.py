@@ -16,7 +16,7 @@ HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
 """Columns of CSV and Parquet; score and id are optional."""
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
-"""Datasets of an HDF5 file with their kind: whole (i) or any (f) numbers; score and id are optional."""
+"""Datasets of an HDF5 file, and whether each holds whole numbers (i) or any numbers (f). score and id are optional."""
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 
@@ -38,7 +38,7 @@ EXPECTED_IN_RECORD = {
     "scores": "a list",
     "scores[]": "a finite number",
 }
-"""What each field of :class:`ImageRecord` must hold, in words."""
+"""The expected value of each field of :class:`ImageRecord`, in words."""
 
 
 def parse_header(content: Any) -> dict[str, Any]:
@@ -66,6 +66,6 @@ def parse_header(content: Any) -> dict[str, Any]:
 
 
 def make_header(predictions: Predictions) -> dict[str, Any]:
-    """Return the header of predictions, to be encoded as JSON."""
+    """Return the header of predictions as a dict for JSON."""
     named = {"dataset": predictions.dataset, "fingerprint": predictions.fingerprint}
     return {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}

@@ -23,7 +23,7 @@ READERS: dict[str, Callable[[Path], Predictions]] = {
     ".parquet": table_files.read_parquet,
     ".h5": table_files.read_h5,
 }
-"""The function that reads a format, by the suffix of its files."""
+"""For each file suffix, the function that reads the format."""
 ENCODERS: dict[str, Callable[[Predictions], bytes]] = {
     ".json": json_files.encode_json,
     ".jsonl": json_files.encode_jsonl,
@@ -31,7 +31,7 @@ ENCODERS: dict[str, Callable[[Predictions], bytes]] = {
     ".parquet": table_files.encode_parquet,
     ".h5": table_files.encode_h5,
 }
-"""The function that encodes a format, by the suffix of its files."""
+"""For each file suffix, the function that encodes the format."""
 
 
 def read_predictions(path: str | Path) -> Predictions:
@@ -49,7 +49,7 @@ def read_predictions(path: str | Path) -> Predictions:
     Raises
     ------
     PredictionsError
-        If the file cannot be read. One line names the file, the place in it and what was expected.
+        If the file cannot be read. The message names the file, the place of the fault and the expected value.
 
     Examples
     --------
@@ -73,12 +73,12 @@ def read_predictions(path: str | Path) -> Predictions:
 
 
 def require_predictions_path(path: str | Path) -> Path:
-    """Refuse a path that no predictions can be written to, before the work is done.
+    """Refuse a path to which predictions cannot be written, before any work is done.
 
     Raises
     ------
     PredictionsError
-        If the suffix is that of no format.
+        If the path does not end in .json, .jsonl, .csv, .parquet or .h5.
     DataError
         If the folder does not exist.
     """
@@ -112,9 +112,9 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
     Raises
     ------
     PredictionsError
-        If the suffix is unknown, or if the format needs pyarrow and pyarrow is not installed.
+        If the path has another suffix, or if the format needs pyarrow and pyarrow is not installed.
     DataError
-        If the disk is full or the folder cannot be written.
+        If the disk is full, or the folder does not exist or cannot be written.
 
     Examples
     --------

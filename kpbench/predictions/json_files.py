@@ -46,7 +46,7 @@ def read_json(path: Path) -> Predictions:
             batches = decode_records(pieces, ImageRecord, EXPECTED_IN_RECORD, place)
             return _combine(batches, parse_header(frame), place)
     except (ValueError, RecursionError):
-        pass  # the list cannot be split: decode the file at once, which finds the place of a fault too
+        pass  # the list cannot be split: decode the file at once, and find any fault
     content = parse_json(data, "the file")
     if not isinstance(content, dict):
         raise PredictionsError(f"holds {json_type(content)}, expected an object with schema {SCHEMA!r}")
@@ -96,10 +96,10 @@ class _Batch(NamedTuple):
     """(K, 2), px."""
     score: Float
     score_count: Int
-    """(N,); -1 for an image without the list."""
+    """(N,), the length of each image's list of scores; -1 for an image without the list."""
     patch_id: Int
     patch_id_count: Int
-    """(N,); -1 for an image without the list."""
+    """(N,), the length of each image's list of IDs; -1 for an image without the list."""
 
 
 def _make_batch(records: list[ImageRecord]) -> _Batch:
@@ -122,12 +122,12 @@ def _make_batch(records: list[ImageRecord]) -> _Batch:
 
 
 def _combine(batches: Iterable[list[ImageRecord]], header: dict[str, Any], place: Place) -> Predictions:
-    """Make predictions of all records; ``place`` names the n-th record."""
+    """Make predictions from all records; ``place`` names the n-th record."""
     columns = map(np.concatenate, zip(_make_batch([]), *map(_make_batch, batches), strict=True))
     whole = _Batch(*columns)
 
     def has_values(name: str, counts: Int) -> bool:
-        """Check that a list is given for every image with keypoints or for none; tell whether it is given."""
+        """Check that all images with keypoints have the list, or none. Return whether they have the list."""
         wrong = np.flatnonzero((counts >= 0) & (counts != whole.keypoint_count))
         lacking = np.flatnonzero((counts < 0) & (whole.keypoint_count > 0))
         if len(wrong):
@@ -170,5 +170,5 @@ def encode_json(predictions: Predictions) -> bytes:
 
 
 def encode_jsonl(predictions: Predictions) -> bytes:
-    """Encode a ``.jsonl`` file, a line per image after the header's."""
+    """Encode a ``.jsonl`` file: a line with the header, then a line per image."""
     return b"\n".join([msgspec.json.encode(make_header(predictions)), *_encode_images(predictions), b""])

@@ -20,17 +20,17 @@ from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, p
 from kpbench.types import Predictions, offsets_of
 
 LARGEST_RATIO = 1100
-"""Bytes that one stored byte of HDF5 may stand for. Gzip compresses by at most 1032."""
+"""Largest accepted compression ratio of HDF5 data. Gzip reaches at most 1032."""
 
 
 def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Place) -> Predictions:
-    """Make predictions of a table with one row per keypoint, in any order.
+    """Make predictions from a table with one row per keypoint, in any order.
 
     Parameters
     ----------
     table : dict of str to ndarray of shape (R,)
-        The columns of :data:`TABLE_COLUMNS`. nan stands for blank. A row with an image_id only is an image without
-        keypoints.
+        The columns of :data:`TABLE_COLUMNS`. nan marks a blank cell. A row with only an image_id is an image
+        without keypoints.
     header : dict
         Further fields of the predictions.
     place : function
@@ -86,7 +86,7 @@ def _make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
 
 
 def _check_columns(names: list[str], place: str) -> list[str]:
-    """Return the names of a table's columns without spaces around them, after checking them."""
+    """Strip and check the names of a table's columns, and return them."""
     names = [name.strip() for name in names]
     if not {"image_id", "x", "y"} <= set(names) <= set(TABLE_COLUMNS) or len(set(names)) < len(names):
         raise PredictionsError(
@@ -99,7 +99,7 @@ def _check_columns(names: list[str], place: str) -> list[str]:
 
 
 def read_csv(path: Path) -> Predictions:
-    """Read a ``.csv`` file: one row per keypoint. The first line may be the header, after a ``#``.
+    """Read a ``.csv`` file: one row per keypoint. The first line may be ``#`` and the predictions' header.
 
     Raises
     ------
@@ -150,7 +150,7 @@ def _strip_blank_lines(path: Path) -> Path | io.BytesIO:
 
 
 def _find_bad_row(path: Path, skipped: int, names: list[str], place: Place, error: BaseException) -> PredictionsError:
-    """Return the error for the first row that is not what pandas was told to read."""
+    """Return an error that names the first row that pandas cannot read."""
     with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
         for row, cells in enumerate(csv.reader(file), -1 - skipped):
             if row < 0:
@@ -241,7 +241,7 @@ def read_h5(path: Path) -> Predictions:
     Raises
     ------
     PredictionsError
-        At the first fault, and for data that is not stored in the file itself.
+        At the first fault, or if data is stored outside the file.
     """
     import h5py
 
@@ -282,7 +282,7 @@ def read_h5(path: Path) -> Predictions:
 
 
 def _to_bytes(text: object) -> bytes:
-    """Return the text of an HDF5 attribute: h5py gives bytes for a fixed length and str for a variable one."""
+    """Return the text of an HDF5 attribute: h5py gives bytes for a fixed and str for a variable length."""
     return text if isinstance(text, bytes) else str(text).encode()
 
 

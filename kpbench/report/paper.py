@@ -110,7 +110,7 @@ SYNTHETIC = {
     "none": dict(zip(PAPER_METRICS, (0.985, 0.999, 0.379), strict=True)),
     "paper": dict(zip(PAPER_METRICS, (0.950, 0.993, 0.727), strict=True)),
 }
-"""The paper's table 2, the synthetic validation set. The keys are values of `deteriorate` in :class:`kpbench.SynthConfig`."""
+"""The paper's table 2 (synthetic validation set), by the value of `deteriorate` in :class:`kpbench.SynthConfig`."""
 SYNTHETIC_RADIUS_PX = (5.0, 80.0)
 """Smallest and largest radius, px, of a synthetic set that is comparable with table 2. They are the defaults."""
 

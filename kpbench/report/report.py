@@ -144,7 +144,8 @@ def _overview_section(report: Report) -> Section:
 def _comparison_section(report: Report) -> Section:
     comparisons = report.comparisons
     tables = [verdict_table(comparisons), *map(difference_table, comparisons)] if comparisons else []
-    return Section("Compared", "Differences are paired: each resample draws the same scenes for both detectors.", tuple(tables))
+    lead = "Differences are paired: each resample draws the same scenes for both detectors."
+    return Section("Compared", lead, tuple(tables))
 
 
 def _paper_section(report: Report) -> Section:
@@ -198,8 +199,8 @@ def _pose_section(report: Report) -> Section:
 def _identity_section(report: Report) -> Section:
     return Section(
         "Identities",
-        "Matched detections, with true IDs in rows and detected IDs in columns. The column \"other\" counts IDs that no "
-        "true keypoint has, and detections that give two IDs to one place.",
+        "Matched detections: true IDs in rows, detected IDs in columns. The column “other” counts IDs that no true "
+        "keypoint has, and detections that give two IDs to one place.",
         tuple(confusion_table(run, report.patch_names) for run in report.runs if run.confusion),
     )
 
@@ -208,8 +209,8 @@ def _worst_cases_section(report: Report) -> Section:
     galleries = (Gallery(run.name, cases) for run, cases in zip(report.runs, report.cases, strict=True))
     return Section(
         "Worst cases",
-        "The images with the most failures, up to the same number of images per condition. Ellipses are true keypoints, "
-        "crosses are detections, numbers are detected IDs.",
+        "The images with the most failures, up to the same number of images per condition. Ellipses are true "
+        "keypoints, crosses are detections, numbers are detected IDs.",
         tuple(galleries) if report.cases else (),
     )
 

@@ -44,7 +44,7 @@ def overview_table(runs: Sequence[Scores]) -> Table:
 
 
 def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simulated") -> Table:
-    """Tabulate the metrics of the paper and of detectors for one of the paper's tables, with one column per rung.
+    """Tabulate the metrics of detectors below one of the paper's tables, with one column per rung.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def breakpoint_table(runs: Sequence[Scores], limit: float = DETECTION_SCORE_LIMI
         f"Where the detection score crosses {limit:g}",
         ("detector", *names),
         tuple(rows),
-        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes, limited to "
-        "the range of the rungs.",
+        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes, limited "
+        "to the range of the rungs.",
     )
 
 
@@ -160,7 +160,7 @@ def group_table(
 ) -> Table:
     """Tabulate the main metrics of groups, one row per group.
 
-    Condition, rung, patch and radius each have a column if some group is limited to a value. Each of the paper's
+    Condition, rung, patch and radius each have a column if some group names a value. Each of the paper's
     formulas as printed has a column if, in some group, its value differs from the metric of one-to-one matching.
 
     Parameters

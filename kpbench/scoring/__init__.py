@@ -1,6 +1,6 @@
 """Score detections against true keypoints: matching, metrics, intervals, groups, comparison, pose of the board.
 
-Arrays go in and numbers come out; nothing in this room reads a file.
+The functions take arrays and return numbers. They read no files.
 """
 
 import lazy_loader

@@ -1,8 +1,8 @@
 """Match detections to true keypoints one to one, in all images at once.
 
-Of all one-to-one assignments the best one is taken: the most matches, then the highest scores, then the smallest
-distances, then the lowest place in (x, y). Identities never decide. The order of images, keypoints and detections
-changes nothing.
+The best of all one-to-one assignments is taken: the most matches, then the highest scores, then the smallest
+distances, then the lowest place in (x, y). Identities do not influence the matches, and neither does the order of
+images, keypoints and detections.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from kpbench.types import Float, Int
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
 """The kinds of a detection, see :class:`Matches`."""
 PAIRS_PER_BLOCK = 2_000_000
-"""Number of candidate pairs whose distances are in memory at a time."""
+"""Approximate number of candidate pairs whose distances are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class TruthPoints:
     xy : ndarray of shape (T, 2), float64
         Place, px.
     radius : ndarray of shape (T,), float64
-        Radius of the keypoint's disc, px. The largest distance of a match is a fraction of it.
+        Radius of the keypoint's disc, px. The matching threshold is given in radii.
     image : ndarray of shape (T,), int64
         Number of the image, 0 or more.
 
@@ -61,11 +61,11 @@ class DetectionPoints:
     xy : ndarray of shape (D, 2), float64
         Place, px.
     score : ndarray of shape (D,), float64
-        The higher, the surer.
+        Confidence; a higher score is more confident.
     image : ndarray of shape (D,), int64
         Number of the image, 0 or more.
     patch_id : ndarray of shape (D,), int64, or None
-        Detected identity. It decides :attr:`Matches.contradicted` and nothing else.
+        Detected identity. Only :attr:`Matches.contradicted` depends on it.
 
     Examples
     --------
@@ -89,17 +89,17 @@ class Matches:
     Attributes
     ----------
     detection : ndarray of shape (T,), int64
-        The detection that is matched to the true keypoint, or -1.
+        Row of the detection that is matched to the true keypoint, or -1.
     distance : ndarray of shape (T,), float64
         Distance to the matched detection, px; nan without a match.
     contradicted : ndarray of shape (T,), bool
-        Whether a second detection has the place and the score of the matched one but another identity. The detector
-        has then named both identities, and no order may decide between them.
+        Whether a second detection has the place and the score of the matched detection, but another identity. The
+        order of the detections must not decide between the two identities.
     nearest : ndarray of shape (D,), int64
-        The nearest true keypoint within the largest distance of a match, or -1.
+        Row of the nearest true keypoint within the matching threshold, or -1.
     kind : ndarray of shape (D,), uint8
-        ``MATCHED``; ``DUPLICATE``: within the largest distance of a match, but not matched; ``NEAR_MISS``: farther
-        away, but within one radius of a true keypoint; ``CLUTTER``: everything else.
+        ``MATCHED``; ``DUPLICATE``: within the matching threshold of a true keypoint, but not matched; ``NEAR_MISS``:
+        beyond every matching threshold, but within one radius of a true keypoint; ``CLUTTER``: all other detections.
 
     Examples
     --------
@@ -119,14 +119,14 @@ class Matches:
 
 
 class _Pairs(NamedTuple):
-    """Pairs of a true keypoint and a detection of one image, as columns of P rows."""
+    """P pairs of a true keypoint and a detection in the same image, as columns."""
 
     t: Int
     """Row of the true keypoint."""
     d: Int
     """Row of the detection."""
     distance: Float
-    """Distance of the two, px."""
+    """Distance between the two, px."""
 
     def select(self, rows: Int | NDArray[np.bool_]) -> _Pairs:
         return _Pairs(self.t[rows], self.d[rows], self.distance[rows])
@@ -140,7 +140,8 @@ def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
     truth : TruthPoints
     found : DetectionPoints
     eps : float
-        Largest distance of a match, in radii of the true keypoint. A distance equal to ``eps * radius`` is a match.
+        Matching threshold: the largest distance of a match, in radii of the true keypoint. A distance equal to
+        ``eps * radius`` is a match.
 
     Returns
     -------
@@ -164,7 +165,7 @@ def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
 
 
 def count_matches(truth: TruthPoints, found: DetectionPoints, eps: Sequence[float]) -> list[int]:
-    """Count the matched keypoints at each of several ``eps``, which are as for :func:`match`."""
+    """Count the matched keypoints at each matching threshold in ``eps``, see :func:`match`."""
     near = _find_pairs(truth, found, max(eps) * truth.radius)
     counts = []
     for value in eps:
@@ -174,7 +175,7 @@ def count_matches(truth: TruthPoints, found: DetectionPoints, eps: Sequence[floa
 
 
 def _find_contested(pairs: _Pairs) -> NDArray[np.bool_]:
-    """Mark the pairs that share a keypoint or a detection with another pair. In practice they are few."""
+    """Mark the pairs that share a keypoint or a detection with another pair. Such pairs are rare."""
     t, d = pairs.t, pairs.d
     return (np.bincount(t)[t] > 1) | (np.bincount(d)[d] > 1) if len(t) else np.zeros(0, bool)
 
@@ -188,7 +189,7 @@ def _choose_matches(
 
 
 def _find_nearest(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
-    """Return the nearest true keypoint of each detection, or -1. Of equally near ones the lowest in (x, y) counts."""
+    """Return the nearest true keypoint of each detection, or -1. The lowest in (x, y) wins a tie."""
     shared = np.bincount(pairs.d, minlength=len(found.xy))[pairs.d] > 1
     nearest = np.full(len(found.xy), -1)
     nearest[pairs.d[~shared]] = pairs.t[~shared]
@@ -212,11 +213,11 @@ def _find_contradicted(contested: _Pairs, detection: Int, found: DetectionPoints
 
 
 def _find_pairs(truth: TruthPoints, found: DetectionPoints, reach: Float) -> _Pairs:
-    """Return all pairs of a keypoint and a detection of its image that are at most ``reach`` (T,) px apart.
+    """Return all pairs of a keypoint and a detection in the same image that are at most ``reach`` (T,) px apart.
 
-    All images lie side by side on one sorted axis: the image's number times a stride, plus x. One binary search per
-    keypoint then finds the detections that are near in x. Rounding on this long axis is allowed for by ``slack``; the
-    distance itself is computed from the places.
+    All images lie side by side along one axis. The coordinate of a detection is the image's number times a stride, plus
+    x. The detections are sorted by this coordinate, so two binary searches per keypoint find the detections that are
+    near in x. ``slack`` allows for rounding along the long axis; distances are computed from the original x and y.
     """
     none = _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     if not len(truth.xy) or not len(found.xy):
@@ -246,21 +247,21 @@ def _find_pairs(truth: TruthPoints, found: DetectionPoints, reach: Float) -> _Pa
 
 
 def _first_of_each(group: Int, *keys: NDArray[Any]) -> Int:
-    """Return for each group the row that is smallest in ``keys``. The first key counts most."""
+    """Return for each group the row that is smallest in ``keys``. The first key has priority."""
     order = np.lexsort((*reversed(keys), group))
     first: Int = order[np.append(True, np.diff(group[order]) != 0)[: len(order)]]
     return first
 
 
 def _assign_contested(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
-    """Return the rows of those contested pairs that are matches."""
+    """Return the rows of the contested pairs that become matches."""
     t, d, distance = pairs
     xy, score = found.xy, found.score
-    # If the detections near a keypoint are near no other keypoint, the keypoint takes the best of them
+    # If the detections near a keypoint are near no other keypoint, the keypoint takes the best detection
     entangled = np.isin(t, t[np.bincount(d)[d] > 1]) if len(d) else np.zeros(0, bool)
     star = np.flatnonzero(~entangled)
     won = [star[_first_of_each(t[star], -score[d[star]], distance[star], xy[d[star], 0], xy[d[star], 1])]]
-    # The others are numbered by score and place, so that the order of the input cannot decide between equals
+    # All other keypoints and detections are numbered by score and place, so that the input order breaks no ties
     rest = np.flatnonzero(entangled)
     keypoints, a = np.unique(t[rest], return_inverse=True)
     a = _rank(truth.xy[keypoints, 1], truth.xy[keypoints, 0])[a]
@@ -276,7 +277,7 @@ def _assign_contested(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints)
 
 
 def _rank(*keys: Float) -> Int:
-    """Return the position of each row in an order in which the last key counts most."""
+    """Return the rank of each row in lexicographic order. The last key has priority."""
     rank = np.empty(len(keys[0]), np.int64)
     rank[np.lexsort(keys)] = np.arange(len(rank))
     return rank
@@ -285,10 +286,10 @@ def _rank(*keys: Float) -> Int:
 def _assign_component(a: Int, b: Int, distance: Float, score: Float) -> Int:
     """Return the rows of the best one-to-one assignment within one connected component of pairs (a, b).
 
-    The sets of detections that can be matched at the same time form a matroid (a transversal matroid). So with any
-    positive weights that rise with the score, the heaviest assignment has the most matches and the highest scores.
-    The weight is the rank of the score, a whole number, less a fraction for the distance. All fractions together
-    count less than one rank.
+    The sets of detections that can all be matched form a transversal matroid. So with any positive weights that rise
+    with the score, the heaviest assignment has the most matches and the highest scores. The weight of a pair is the
+    rank of the score, a whole number, minus a fraction that rises with the distance. The fractions of an assignment add
+    up to less than one rank.
     """
     if not len(a):
         return np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""Compute the errors of a known board's pose that follow from a detector's errors."""
+"""Compute the errors of a known board's pose that a detector's errors cause."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from kpbench.scoring.scores import Scores
 from kpbench.types import Float
 
 LEAST_POINTS = 4
-"""Number of points that fix the pose of a plane."""
+"""Smallest number of points that determine the pose of a plane."""
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class PoseErrors:
     Attributes
     ----------
     translation_percent : ndarray of shape (N,), float64
-        Distance between the estimated and the true place of the board's origin, in % of its true distance from the
-        camera.
+        Distance between the estimated and the true place of the board's origin, in % of the origin's true
+        distance from the camera.
     rotation_deg : ndarray of shape (N,), float64
         Angle between the estimated and the true orientation, degrees.
 
@@ -43,9 +43,9 @@ class PoseErrors:
 
 @dataclass(frozen=True)
 class PoseGroup:
-    """Percentiles of the pose errors of a group of images: all images, or those of one condition and rung.
+    """Percentiles of the pose errors over all images, or over the images of one condition and rung.
 
-    The percentiles are those of the images with a pose; None without any.
+    Only images with a pose count. The percentiles are None if no image has a pose.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ def group_pose_errors(scores: Scores, errors: PoseErrors) -> tuple[PoseGroup, ..
     Returns
     -------
     tuple of PoseGroup
-        All images, then each condition and rung.
+        One group for all images, then one group for each condition and rung.
 
     Examples
     --------
@@ -114,11 +114,11 @@ def group_pose_errors(scores: Scores, errors: PoseErrors) -> tuple[PoseGroup, ..
 
 
 def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) -> PoseErrors:
-    """Compare the board's pose from the matched detections of each image with that from the true keypoints.
+    """Compare two poses of the board in each image: from the matched detections, and from the true keypoints.
 
-    Both poses are estimated by ``solvePnP``. The match tells which keypoint of the board a detection is, so wrong
-    identities and false alarms have no influence. A planar board that is seen from far may flip; the flip counts as a
-    large rotation.
+    ``solvePnP`` estimates both poses. The match tells which keypoint of the board a detection is, so wrong identities
+    and false alarms have no influence. The estimated pose of a distant board may flip; a flip counts as a large
+    rotation.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) ->
         R_true, t_true = _estimate_pose(points_mm, true_xy[n], camera)
         R, t = _estimate_pose(points_mm[matched], outcomes.detections.xy[detection[n][matched]], camera)
         translation[n] = 100 * np.linalg.norm(t - t_true) / np.linalg.norm(t_true)
-        # arctan2 of sine and cosine: arccos of the trace alone cannot tell small angles from none
+        # arctan2 of sine and cosine resolves small angles, which arccos of the trace would round to zero
         turn = R @ R_true.T
         sine = np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
         rotation[n] = np.degrees(np.arctan2(sine, np.trace(turn) - 1))
@@ -177,7 +177,7 @@ def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) ->
 def _estimate_pose(points_mm: Float, xy: Float, camera: Camera) -> tuple[Float, Float]:
     """Return the rotation (3, 3) and the translation (3,) in mm from the board's frame to the camera's.
 
-    IPPE gives the better of the plane's two poses, Levenberg-Marquardt refines it.
+    IPPE returns the better of the two candidate poses of a plane. Levenberg-Marquardt refines this pose.
     """
     import cv2
 

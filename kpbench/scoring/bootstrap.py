@@ -2,9 +2,10 @@
 
 Images of one scene are not independent, so whole scenes are drawn with replacement.
 
-Plain percentile intervals of few scenes are too narrow and off centre. Three corrections change the percentiles:
-the factor C/(C - 1) that a variance of C scenes lacks and the tails of Student's t [1]_, and a shift for bias and
-skewness, BC_a [2]_. ``benchmarks/accuracy/coverage.py`` measures how often the intervals hold the truth.
+Plain percentile intervals from few scenes are too narrow and off centre. Three corrections change the percentiles. The
+factor C/(C - 1) corrects the variance of C scenes, and Student's t replaces the normal distribution [1]_. The method
+BC_a shifts the percentiles for bias and skewness [2]_. ``benchmarks/accuracy/coverage.py`` measures how often the
+intervals contain the true value.
 
 References
 ----------
@@ -26,15 +27,15 @@ from scipy.special import ndtr, ndtri, stdtrit
 from kpbench.types import Float, Int
 
 TAIL = 0.025
-"""Probability that the true value lies below an interval, and the same above it: the intervals are of 95 %."""
+"""Nominal probability on each side of a 95 % interval that the true value lies beyond the bound."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
-"""Largest number of kinds of scenes that are drawn one by one. More kinds are pooled."""
+"""Largest number of kinds of scenes (scenes of equal counts) to draw from. If there are more, scenes are pooled."""
 
 
 def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
-    """Add up the counts of images of equal scene.
+    """Add up the counts of the images of each scene.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
     Returns
     -------
     ndarray of shape (C, M)
-        Counts per scene, in the order of the scenes' numbers.
+        Counts per scene, in the order of the scenes' numbers; in the order of the images if no two share a scene.
     """
     order = np.argsort(scene, kind="stable")
     starts = np.flatnonzero(np.append(True, np.diff(scene[order]) != 0)[: len(order)])
@@ -58,15 +59,15 @@ def bootstrap_intervals(
 ) -> dict[str, Interval | None]:
     """Compute 95 % intervals of statistics of summed counts, by drawing scenes with replacement.
 
-    Scenes of equal counts are of one kind. Drawing C scenes is drawing a number of scenes of each kind, a multinomial.
-    So a million scenes cost as much as the few hundred kinds among them.
+    Scenes of equal counts form one kind. To draw C scenes, the function draws how many scenes of each kind there are,
+    from a multinomial distribution. So the cost depends on the number of kinds, not on the number of scenes.
 
     Parameters
     ----------
     sums : ndarray of shape (C, M)
         Counts per scene, whole numbers.
     statistics : function
-        Computes named values of shape (...) from sums of shape (..., M); nan where a value is undefined.
+        Function that computes named values of shape (...) from sums of shape (..., M); nan where a value is undefined.
     resamples : int
         Number of resamples. 0 computes no intervals.
     seed : int
@@ -75,7 +76,7 @@ def bootstrap_intervals(
     Returns
     -------
     dict of str to (low, high) or None
-        None for fewer than two scenes, and for a value that is undefined in all resamples.
+        None for fewer than two scenes, without resamples, and for a value that is undefined in all resamples.
 
     Examples
     --------
@@ -90,7 +91,7 @@ def bootstrap_intervals(
         return dict.fromkeys(statistics(sums.sum(axis=0)))
     kinds, count = _unique_rows(sums)
     rng = np.random.default_rng(seed)
-    if len(kinds) > MOST_KINDS:  # pool scenes at random: sums of equally large pools vary as much as sums of scenes
+    if len(kinds) > MOST_KINDS:  # random pools of equal size: sums of drawn pools vary like sums of drawn scenes
         shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
         count = np.ones(MOST_KINDS, np.int64)
@@ -107,7 +108,7 @@ def bootstrap_intervals(
 
 
 def _percentile_levels(values: Float, found: float, without_one: Float, count: Int, scenes: int) -> Float:
-    """Return the two levels whose percentiles bound a 95 % interval.
+    """Return the two quantile levels that bound a 95 % interval.
 
     For many scenes without bias and skewness the levels are 0.025 and 0.975.
 
@@ -118,7 +119,7 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
     found : float
         The statistic of all scenes.
     without_one : ndarray of shape (K,), float64
-        The statistic without one scene of each kind; its skewness is that of the jackknife.
+        The jackknife: the statistic of all scenes but one, for a scene of each kind. It gives the skewness.
     count : ndarray of shape (K,), int64
         Number of scenes of each kind.
     scenes : int
@@ -138,9 +139,9 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
 
 
 def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:
-    """Return the different rows of a table of whole numbers, in a fixed order, and the count of each.
+    """Return the distinct rows of a table of whole numbers, in lexicographic order, and the count of each row.
 
-    The rows are packed into one integer each where they fit; that is many times faster than ``np.unique`` by rows.
+    Each row is packed into one integer if 62 bits suffice. Sorting integers is many times faster than sorting rows.
     """
     least = table.min(axis=0)
     sizes = (table.max(axis=0) - least).astype(object) + 1

@@ -15,7 +15,7 @@ from kpbench.scoring.scores import Scores
 from kpbench.types import Float, Int
 
 DETECTION_SCORE_LIMIT = 0.9
-"""The detection score whose crossing is a breakpoint, unless another is given."""
+"""Default limit. A breakpoint is where the detection score crosses the limit."""
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Breakpoint:
     condition : str
     limit : float
     crossing : {"falls", "rises", "over", "under"}
-        "falls": the score falls under the limit as the rung grows. "rises": it rises to the limit. "over", "under": it
-        is on that side at all rungs.
+        "falls": the score falls under the limit as the rung grows. "rises": the score rises to the limit or over it.
+        "over": the score is at or over the limit at all rungs. "under": the score is under the limit at all rungs.
     rung : float or None
-        The first such crossing, on straight lines between the rungs; None for "over" and "under".
+        The first such crossing, interpolated linearly between rungs; None for "over" and "under".
     interval : (low, high) or None
-        95 % interval from resampled scenes. A resample that does not cross between the rungs counts as the first or
-        the last rung.
+        95 % interval of the rung from resampled scenes. A resample without such a crossing counts as the first or the
+        last rung.
 
     Examples
     --------
@@ -54,9 +54,9 @@ class Breakpoint:
 
 
 def find_breakpoints(scores: Scores, limit: float = DETECTION_SCORE_LIMIT) -> tuple[Breakpoint, ...]:
-    """Find all crossings of every condition.
+    """Find the first falling and the first rising crossing of each condition.
 
-    The detection score is that of one-to-one matching, whatever the settings.
+    The detection score comes from one-to-one matching, even if the settings say "literal".
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def find_breakpoints(scores: Scores, limit: float = DETECTION_SCORE_LIMIT) -> tu
     Returns
     -------
     tuple of Breakpoint
-        For each condition at most one that "falls" and one that "rises"; or one that is "over" or "under".
+        For each condition, at most one that "falls" and at most one that "rises", or one that is "over" or "under".
 
     Examples
     --------
@@ -121,9 +121,10 @@ def _detection_scores(sums: NDArray[Any], rungs: int) -> Float:
 
 
 def _first_crossing(levels: Float, value: Float, limit: float, rising: bool) -> Float:
-    """Return where values of shape (..., R) first fall under a limit, or rise to it; nan where they do not.
+    """Return the level at which values of shape (..., R) first fall under a limit; nan without a crossing.
 
-    The values are those at ``levels`` (R,). Between two levels they lie on a straight line.
+    If ``rising``, return the level at which the values first rise to the limit. The values at ``levels`` (R,) are
+    interpolated linearly.
     """
     if len(levels) < 2:
         return np.full(value.shape[:-1], np.nan)

@@ -18,7 +18,7 @@ from kpbench.types import Float
 COMPARED_METRICS = (*PAPER_METRICS, "precision", "f1")
 """Names of the metrics that are compared."""
 LOWER_IS_BETTER = ("average_false_alarm",)
-"""Names of the metrics whose lower value is the better one."""
+"""Names of the metrics for which a lower value is better."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class Difference:
     first, second : float or None
         The metric of each detector; None where undefined.
     interval : (low, high) or None
-        95 % interval of the difference, from scenes resampled for both detectors alike. None for fewer than two
-        scenes.
+        95 % interval of the difference. Each resample draws the same scenes for both detectors. None for fewer than
+        two scenes, without resamples, or if a metric is undefined.
 
     Examples
     --------
@@ -56,12 +56,12 @@ class Difference:
 
     @property
     def value(self) -> float | None:
-        """First minus second; None if one of the two is undefined."""
+        """First minus second; None if one of the two metrics is undefined."""
         return None if self.first is None or self.second is None else self.first - self.second
 
     @property
     def verdict(self) -> str:
-        """Whether the first is "better" or "worse"; "even" where the interval holds 0 or is None."""
+        """Verdict on the first detector: "better", "worse", or "even" if the interval contains 0 or is None."""
         if self.value is None or self.interval is None or self.interval[0] <= 0 <= self.interval[1]:
             return "even"
         return "better" if (self.value > 0) != (self.metric in LOWER_IS_BETTER) else "worse"
@@ -80,7 +80,7 @@ class Comparison:
     first, second : str
         Names of the detectors.
     differences : tuple of Difference
-        Those over all images, then those of each condition and rung.
+        The differences over all images, then the differences of each condition and rung.
 
     Examples
     --------
@@ -95,7 +95,7 @@ class Comparison:
     differences: tuple[Difference, ...]
 
     def verdicts(self, metric: str) -> dict[str, int]:
-        """Count how often the first is better, even and worse over the rungs; over all images if there are no rungs."""
+        """Count the verdicts on the first detector: one per rung, or one over all images if there are no rungs."""
         overall, *of_rungs = (d.verdict for d in self.differences if d.metric == metric)
         found = of_rungs or [overall]
         return {verdict: found.count(verdict) for verdict in ("better", "even", "worse")}
@@ -168,13 +168,13 @@ def _compute_differences(first: Scores, second: Scores) -> Iterator[Difference]:
 
 
 def check_regression(comparisons: Sequence[Comparison]) -> None:
-    """Refuse a first detector that is worse than another over all images, in one of the paper's three metrics.
+    """Refuse a first detector that is worse than another in one of the paper's three metrics over all images.
 
     Raises
     ------
     GateFailed
-        If a metric is worse, or differs where all images are of one scene and have no interval. The message names
-        every such metric.
+        If a metric is worse, or if a metric differs and the difference has no interval, as with a single scene. The
+        message names every such metric.
 
     Examples
     --------

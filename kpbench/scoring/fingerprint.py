@@ -1,4 +1,4 @@
-"""Check that predictions are of the images of a dataset: by its fingerprint, then by the numbers of its images."""
+"""Check that predictions belong to a dataset: first by fingerprint, then by image IDs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from kpbench.types import Int, Predictions, Truth
 
 
 def find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
-    """Return the position in the truth of each detection's image, of shape (D,).
+    """Return for each detection the position of its image in the truth, of shape (D,).
 
     Raises
     ------

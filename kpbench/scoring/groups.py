@@ -24,7 +24,7 @@ from kpbench.scoring.outcomes import Outcomes
 from kpbench.types import Int
 
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)
-"""Edges of the bins of radii, px: low < radius <= high."""
+"""Edges of the bins of radii, px. A bin holds low < radius <= high."""
 _NEED_DETECTIONS = {
     *("average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"),
     *("detections", "duplicate", "near_miss", "clutter"),
@@ -46,7 +46,7 @@ class GroupKey(NamedTuple):
     patch_id : int or None
         Identity of the true keypoints.
     radius_px : (low, high) or None
-        Radii of the true keypoints, low < radius <= high; a ``high`` of None is no limit.
+        Radii of the true keypoints, low < radius <= high; no upper limit if ``high`` is None.
 
     Examples
     --------
@@ -68,11 +68,11 @@ class Group:
     Attributes
     ----------
     key : GroupKey
-        Its first three fields are attributes of the group too.
+        The condition, rung and patch ID are also properties of the group.
     metrics : dict of str to float or None
-        The names of :data:`kpbench.scoring.METRICS`; None where a metric is undefined for the group.
+        The value of each of :data:`kpbench.scoring.METRICS`; None if the metric is undefined for the group.
     counts : dict of str to int or None
-        The names of :data:`kpbench.scoring.COUNTS`; None where a count is undefined for the group.
+        The value of each of :data:`kpbench.scoring.COUNTS`; None if the count is undefined for the group.
     intervals : dict of str to (low, high) or None
         95 % bootstrap intervals of the metrics that are ratios of counts.
 
@@ -110,7 +110,7 @@ class Group:
 
 
 class _Units(NamedTuple):
-    """The M units that groups consist of: images, or the keypoints of one label in one image."""
+    """The M units that groups consist of. A unit is an image, or the keypoints of one label in one image."""
 
     outcomes: Outcomes
     sums: Int
@@ -122,10 +122,10 @@ class _Units(NamedTuple):
     of_detection: Int
     """Unit of each detection, or -1, of shape (D,)."""
     shared: NDArray[np.bool_]
-    """Whether the unit's image has other units, so that its false alarms belong to no unit, of shape (M,)."""
+    """Whether the unit's image has several units, of shape (M,). The image's false alarms then belong to no unit."""
 
     def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
-        """Compute a group for each key; ``label`` (M,) is the position in ``keys`` of each unit."""
+        """Compute a group for each key; ``label`` (M,) is each unit's position in ``keys``."""
         label_or_none = np.append(label, -1)  # a unit of -1 has the label -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
         labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
@@ -173,7 +173,8 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     ------
     Group
         First all images. Then each condition and rung; each patch within each condition and rung; each patch over all
-        images; and each bin of radii over all images. A division into one part only is left out.
+        images; and each bin of radii over all images. A single patch or bin has no group, and neither have images
+        without condition and rung.
     """
     truth, n = outcomes.truth, len(outcomes.truth)
     image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image
@@ -187,7 +188,7 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     codes, code = np.unique(condition * len(rungs) + rung, return_inverse=True)
     keys = [GroupKey(str(conditions[c // len(rungs)]) or None, _as_written(rungs[c % len(rungs)])) for c in codes]
     has_conditions = keys != [GroupKey()]
-    if has_conditions:  # images without condition beside others are no group: their key would read as all images
+    if has_conditions:  # images without condition and rung would have the key of all images
         yield from (group for group in images.group(keys, code) if group.key != GroupKey())
 
     patches, patch = np.unique(outcomes.truth_id, return_inverse=True)
@@ -213,7 +214,7 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
 def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, Int, _Units]:
     """Divide each image into units of keypoints of one label.
 
-    A false alarm has no label. It belongs to the image's unit if the image has only one, else to none.
+    A false alarm has no label. If the image has a single unit, the false alarm belongs to this unit, else to no unit.
 
     Parameters
     ----------
@@ -238,9 +239,9 @@ def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, In
 
 
 def _rows_of_labels(label: Int, labels: int) -> list[Int]:
-    """Return the rows of each label from 0 to ``labels`` - 1, rising. Rows of other labels are left out."""
+    """Return the rows of each label from 0 to ``labels`` - 1, in rising order. Rows of other labels are left out."""
     if labels < 2**15:
-        label = label.astype(np.int16)  # numpy sorts 16 bits in linear time
+        label = label.astype(np.int16)  # numpy sorts integers of 16 bits in linear time
     order = np.argsort(label, kind="stable")
     edges = np.searchsorted(label[order], np.arange(labels + 1))
     return [order[a:b] for a, b in pairwise(edges.tolist())]

@@ -1,4 +1,4 @@
-"""Compute metrics from counts. Nothing in this module knows images or files.
+"""Compute metrics from counts, without images or files.
 
 A metric that would be 0/0 is undefined. An undefined metric is nan in arrays and None in results, never 0 or 1.
 ``docs/reference/metrics.md`` describes each metric with its edge cases.
@@ -24,7 +24,7 @@ SUMS = (
     "duplicate",
     "near_miss",
 )
-"""Names of the nine counts per image. All other counts and all ratios are computed from their sums over images."""
+"""Names of the nine counts per image. Their sums give all ratios, and all other counts except ``scenes``."""
 
 PAPER_METRICS = ("detection_score", "id_matching_score", "average_false_alarm")
 """Names of the paper's three metrics."""
@@ -65,7 +65,7 @@ COUNTS = (
     "matched_literal",
     "id_correct_literal",
 )
-"""Names of all counts. A truth is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
+"""Names of all counts. A true keypoint is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
 
 LABELS = {
     "detection_score": "detection score",
@@ -132,10 +132,10 @@ def compute_ratios(sums: NDArray[Any], matching: str) -> dict[str, Float]:
 
 
 def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float, Float, Float]:
-    """Count matches and detections of at least each score.
+    """Count the matches and the detections at or above each score threshold.
 
-    The matching prefers high scores. So removing all detections below a threshold keeps the number of matches above
-    it, and one matching serves all thresholds. A threshold cannot separate equal scores.
+    The matching prefers high scores. So the number of matches at or above a threshold stays the same if all detections
+    below the threshold are removed. One matching therefore serves all thresholds. Equal scores share a threshold.
 
     Parameters
     ----------
@@ -147,9 +147,9 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
     Returns
     -------
     threshold : ndarray of shape (K,), float64
-        The different scores, falling.
+        The distinct scores, in falling order.
     matches, detections : ndarray of shape (K,), float64
-        Their numbers at each threshold.
+        Number of matches, and number of detections, at each threshold.
     """
     every, hits = np.sort(score), np.sort(score[hit])  # sorting values is several times faster than sorting indices
     first = np.flatnonzero(np.append(True, np.diff(every) != 0)[: len(every)])[::-1]
@@ -162,14 +162,14 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
 def compute_average_precision(score: Float, hit: NDArray[np.bool_], truths: int) -> float | None:
     """Compute the area under the precision-recall curve, without interpolation.
 
-    The area is the sum of (recallₖ − recallₖ₋₁) · precisionₖ over all thresholds k, from the highest on.
+    The area is the sum of (recallₖ − recallₖ₋₁) · precisionₖ over all thresholds k, from the highest down.
 
     Parameters
     ----------
     score, hit : ndarray of shape (D,)
         As for :func:`count_above_thresholds`.
     truths : int
-        Number of true keypoints. Without any the result is None.
+        Number of true keypoints. If it is 0, the result is None.
     """
     _, matches, detections = count_above_thresholds(score, hit)
     return float(np.sum(np.diff(matches, prepend=0.0) / truths * matches / detections)) if truths else None

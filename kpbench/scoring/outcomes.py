@@ -1,4 +1,4 @@
-"""Check predictions against the truth and match them: the rows that all metrics and reports are made from."""
+"""Check predictions against the truth and match them. The resulting rows are the input of all metrics and reports."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Settings:
     Attributes
     ----------
     eps : float
-        Largest distance of a match, in radii of the true keypoint's projected circle.
+        Matching threshold: the largest distance of a match, in radii of the true keypoint's projected circle.
     eps_radius : {"major", "minor", "mean"}
-        The radius: the major or the minor semi-axis of the projected circle, or half their sum.
+        The radius of a projected circle: its major semi-axis, its minor semi-axis, or the mean of both.
     matching : {"one-to-one", "literal"}
         "literal" takes the paper's formulas as they are printed. Every detection within ``eps`` then counts, so a
         detection score can exceed 1.
@@ -66,8 +66,8 @@ class Settings:
 class Outcomes:
     """The outcome of each of T true keypoints and D detections in N images.
 
-    Rows keep the order of the truth and of the predictions. The rows of an image then lie together in memory; with
-    millions of images any other order is slow.
+    Rows keep the order of the truth and of the predictions, so that the rows of an image are contiguous in memory. With
+    millions of images, any other order is slow.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Outcomes:
     correct : ndarray of shape (T,), bool
         Whether the true keypoint is matched by a detection of the right identity.
     literally_correct : ndarray of shape (D,), bool
-        Whether the detection has the identity of the nearest true keypoint within the largest distance of a match.
+        Whether the detection has the identity of the nearest true keypoint within the matching threshold.
     settings : Settings
     detector : dict
         The detector as the predictions describe it.
@@ -118,7 +118,7 @@ class Outcomes:
         return self.sum_rows(self.truth_points.image, self.detections.image, len(self.truth))
 
     def sum_rows(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
-        """Count true keypoints and detections by rows of your own.
+        """Count true keypoints, detections and their outcomes by rows that the caller defines, such as images.
 
         Parameters
         ----------
@@ -132,7 +132,7 @@ class Outcomes:
         Returns
         -------
         ndarray of shape (rows, 9), int64
-            In the order of :data:`kpbench.scoring.SUMS`.
+            Counts of each row, in the order of :data:`kpbench.scoring.SUMS`.
         """
 
         def count(row: Int) -> Int:
@@ -173,9 +173,10 @@ def match_predictions(
     Raises
     ------
     PredictionsError
-        If the predictions are of other images, or of another dataset by its fingerprint.
+        If the predictions are of other images, or have another dataset's fingerprint.
     DataError
-        If there are no images, or if a place is not finite or a radius is not a positive number.
+        If there are no images, two images share an image_id, a place is not finite, or a radius is not a positive
+        number.
 
     Examples
     --------
@@ -191,7 +192,7 @@ def match_predictions(
     image = find_images(truth, predictions, allow_missing)
     points = _read_points(truth, settings.eps_radius)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
-    # A detector that found nothing contradicts no identity, even if its file holds no IDs
+    # Predictions without detections show no lack of IDs, so the metrics of identities stay defined
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
     detections = DetectionPoints(predictions.xy, predictions.score, image, ids)
     matches = match(points, detections, settings.eps)

@@ -1,15 +1,16 @@
-"""Score detections against true keypoints: the paper's three metrics and more. Nothing here reads a file.
+"""Score detections against true keypoints: the paper's three metrics and more.
 
 Conventions
 -----------
-A detection is within reach of a true keypoint if their distance is **at most** ε. ε is a fraction of the radius of
+A detection can match a true keypoint if their distance is **at most** the matching threshold: ε times the radius of
 *that* keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection is matched to one keypoint. Of all
 one-to-one assignments kpbench takes the best: the most matches, then the highest scores, then the smallest distances,
-then the lowest place in (x, y). Identities never decide, and the order of images, keypoints and detections changes
-nothing.
+then the lowest place in (x, y). Identities do not influence the matches, and neither does the order of images,
+keypoints and detections.
 
-The steps are: assignment (matches), outcomes (rows), metrics and bootstrap (numbers from sums), groups (of images and
-keypoints), and this module. ``docs/reference/metrics.md`` describes each metric with its edge cases.
+The steps are the modules ``assignment`` (matches), ``outcomes`` (rows), ``metrics`` and ``bootstrap`` (numbers from
+sums), ``groups`` (of images and keypoints), and this module. ``docs/reference/metrics.md`` describes each metric with
+its edge cases.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ SCHEMA = "kpbench.scores/1"
 EPS_GRID = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5, 0.7, 1.0)
 """The values of ε, in radii, at which a detector is scored for :attr:`Scores.eps_curve`."""
 CURVE_POINTS = 201
-"""Number of points that a precision-recall curve is thinned to."""
+"""Largest number of points of a precision-recall curve. Longer curves are thinned."""
 
 
 @dataclass(frozen=True)
@@ -45,15 +46,15 @@ class Scores:
     overall : Group
         The metrics over all images.
     by : tuple of Group
-        The metrics of each condition and rung. If the truth has several patches, also of each patch within each
-        condition and rung, and over all images. If radii fall into several bins, also of each bin over all images.
+        The metrics of each condition and rung. If the truth has several patches, also the metrics of each patch, within
+        each condition and rung and over all images. If radii fall into several bins, also the metrics of each bin.
     confusion : dict
-        The identities of matched detections. ``ids`` are the true ones, sorted; ``matrix`` has a row per true ID and
-        a column per detected ID. Its last column counts IDs that no true keypoint has, and contradicted IDs. Empty for
-        a detector without identities.
+        The identities of matched detections. ``ids`` holds the true IDs, sorted. ``matrix`` has a row per true ID and
+        a column per detected ID. The last column counts IDs that no true keypoint has, and contradicted IDs. The dict
+        is empty for a detector without identities.
     curve : dict
-        ``score``, ``precision``, ``recall`` and ``average_false_alarm`` of the detections of at least that score,
-        from the highest score on; at most 201 points.
+        ``score`` holds score thresholds in falling order. ``precision``, ``recall`` and ``average_false_alarm`` are the
+        metrics of the detections at or above each threshold. At most 201 points.
     outcomes : Outcomes
         The rows behind the numbers: every true keypoint and every detection.
     name : str
@@ -109,7 +110,7 @@ class Scores:
 
     @cached_property
     def eps_curve(self) -> dict[str, list[float | None]]:
-        """``detection_score`` and ``average_false_alarm`` of one-to-one matching at other values of ``eps``."""
+        """``detection_score`` and ``average_false_alarm`` of one-to-one matching at several values of ``eps``."""
         outcomes = self.outcomes
         truths, detections, images = len(outcomes.truth_id), len(outcomes.detections.xy), len(outcomes.truth)
         counts = count_matches(outcomes.truth_points, outcomes.detections, EPS_GRID)
@@ -120,7 +121,7 @@ class Scores:
         }
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a flat table with a row per group, the first overall. Bounds of intervals end in _low and _high."""
+        """Return a flat table: a row over all images, then a row per group. Bounds of intervals end in _low and _high."""
         return [
             {"condition": g.condition, "rung": g.rung, "patch_id": g.patch_id}
             | dict(zip(("radius_px_low", "radius_px_high"), g.key.radius_px or (None, None), strict=True))
@@ -180,7 +181,7 @@ def _trace_curve(outcomes: Outcomes) -> dict[str, list[float | None]]:
 
 
 class HasTruth(Protocol):
-    """A dataset as :func:`kpbench.score` needs it."""
+    """The part of a dataset that :func:`kpbench.score` uses."""
 
     @property
     def truth(self) -> Truth:
@@ -218,16 +219,17 @@ def score(
     Raises
     ------
     PredictionsError
-        If the predictions are of other images than the truth's, or of another dataset by its fingerprint.
+        If the predictions are of other images than the truth, or have another dataset's fingerprint.
     DataError
-        If a place of the truth is not finite or a radius is not a positive number.
+        If the truth has no images, two of its images share an image_id, a place is not finite, or a radius is not a
+        positive number.
     ValueError
         If a setting is out of its range.
 
     Notes
     -----
-    This function computes the paper's three metrics from one-to-one matching. It is written to be read and slow,
-    because it tries every assignment. A test checks that ``score`` gives the same numbers.
+    The function below computes the paper's three metrics from one-to-one matching. It is short but slow, because it
+    tries every assignment. A test checks that ``score`` gives the same numbers.
 
     >>> from itertools import permutations
     >>> from math import hypot
@@ -251,8 +253,8 @@ def score(
     ...         "average_false_alarm": (detections - matched) / len(images),
     ...     }
 
-    In the paper's own formulas several detections of one keypoint count. A detection score after these formulas,
-    `matching` "literal", is at least as high as the one above, and the average false alarm at most as high.
+    In the paper's own formulas (`matching` "literal"), several detections of one keypoint all count. These formulas
+    give a detection score that is at least as high, and an average false alarm that is at most as high.
 
     Examples
     --------
@@ -292,7 +294,7 @@ def compute_scores(outcomes: Outcomes) -> Scores:
 
 
 def check_gates(scores: Scores, least: dict[str, float], most: dict[str, float]) -> None:
-    """Refuse scores beyond limits. An undefined metric meets no limit.
+    """Refuse scores that miss a limit. An undefined metric misses every limit.
 
     Parameters
     ----------
