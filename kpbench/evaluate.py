@@ -28,7 +28,7 @@ from kpbench.scoring.scores import Scores, score
 from kpbench.types import Predictions, Truth, UInt8
 
 DEFAULT_DATASET = Path("kpbench-data")
-"""The folder that ``kpbench synth`` writes by default. Scoring uses it if neither user nor file names a dataset here."""
+"""Default folder of ``kpbench synth``, and the truth if neither user nor file names a dataset that exists."""
 MOST_CASES = 12
 """Number of failures to show in a report, divided among its detectors."""
 

@@ -91,7 +91,7 @@ def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate 
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
-    """Tabulate the paper's table 2, with the detectors' metrics in the column of ``deteriorate`` ("none" or "paper")."""
+    """Tabulate the paper's table 2 with rows for detectors. ``deteriorate``, "none" or "paper", selects their column."""
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
         rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
@@ -140,8 +140,8 @@ def breakpoint_table(runs: Sequence[Scores], limit: float = DETECTION_SCORE_LIMI
         f"Where the detection score crosses {limit:g}",
         ("detector", *names),
         tuple(rows),
-        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes, limited "
-        "to the range of the rungs.",
+        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes. The "
+        "intervals end at the first or the last rung at the latest.",
     )
 
 

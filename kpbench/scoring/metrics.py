@@ -65,7 +65,7 @@ COUNTS = (
     "matched_literal",
     "id_correct_literal",
 )
-"""Names of all counts. A true keypoint is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
+"""Names of all counts. A truth is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
 
 LABELS = {
     "detection_score": "detection score",

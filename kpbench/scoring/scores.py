@@ -121,7 +121,10 @@ class Scores:
         }
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a flat table: a row over all images, then a row per group. Bounds of intervals end in _low and _high."""
+        """Return a flat table: a row over all images, then a row per group.
+
+        The names of interval bounds end in ``_low`` and ``_high``.
+        """
         return [
             {"condition": g.condition, "rung": g.rung, "patch_id": g.patch_id}
             | dict(zip(("radius_px_low", "radius_px_high"), g.key.radius_px or (None, None), strict=True))
