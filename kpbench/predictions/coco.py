@@ -272,7 +272,7 @@ def _column(entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: typ
 
 
 def _points(entries: Sequence[CocoAnnotation | CocoResult]) -> NDArray[np.float64]:
-    """Return rows x, y, v."""
+    """Return an array with a row (x, y, v) per entry."""
     points = chain.from_iterable(map(attrgetter("keypoints"), entries))
     return np.fromiter(points, np.float64, 3 * len(entries)).reshape(-1, 3)
 

@@ -16,7 +16,7 @@ HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
 """Columns of CSV and Parquet; score and id are optional."""
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
-"""Datasets of an HDF5 file, and whether each holds whole numbers (i) or any numbers (f). score and id are optional."""
+"""HDF5 datasets of a file, and whether each holds whole numbers (i) or any numbers (f). score and id are optional."""
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 

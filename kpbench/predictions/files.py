@@ -112,7 +112,7 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
     Raises
     ------
     PredictionsError
-        If the path has another suffix, or if the format needs pyarrow and pyarrow is not installed.
+        If the path ends in none of these suffixes, or if the format needs pyarrow and pyarrow is not installed.
     DataError
         If the disk is full, or the folder does not exist or cannot be written.
 

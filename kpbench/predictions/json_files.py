@@ -89,17 +89,17 @@ class _Batch(NamedTuple):
     """Some records as columns, for N images and K detections."""
 
     image_id: Int
-    """(N,)"""
+    """Of shape (N,)."""
     keypoint_count: Int
-    """(N,)"""
+    """Of shape (N,)."""
     xy: Float
-    """(K, 2), px."""
+    """Of shape (K, 2), px."""
     score: Float
     score_count: Int
-    """(N,), the length of each image's list of scores; -1 for an image without the list."""
+    """Length of each image's list of scores, of shape (N,); -1 for an image without the list."""
     patch_id: Int
     patch_id_count: Int
-    """(N,), the length of each image's list of IDs; -1 for an image without the list."""
+    """Length of each image's list of IDs, of shape (N,); -1 for an image without the list."""
 
 
 def _make_batch(records: list[ImageRecord]) -> _Batch:

@@ -1,4 +1,4 @@
-"""Predictions as tables: CSV and Parquet with one row per keypoint, HDF5 with one dataset per column."""
+"""Predictions as tables: CSV and Parquet with one row per keypoint, HDF5 with one HDF5 dataset per column."""
 
 from __future__ import annotations
 
@@ -236,7 +236,7 @@ def encode_parquet(predictions: Predictions) -> bytes:
 
 
 def read_h5(path: Path) -> Predictions:
-    """Read an ``.h5`` file: a dataset per column, with the header in an attribute.
+    """Read an ``.h5`` file: an HDF5 dataset per column, with the header in an attribute.
 
     Raises
     ------

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 CHART_COLOURS = 9
 """Number of line colours, which have the CSS classes s0 to s8. Further series reuse the colours with dashed lines."""
-# Colours with contrast on white and on near-black that colour-blind readers can tell apart (Okabe and Ito 2008)
+# Colour-blind readers can tell the colours apart on white and on near-black (after Okabe and Ito 2008)
 CHART_STYLE = """\
 :root{--s0:#0067a8;--s1:#c2410c;--s2:#00795a;--s3:#8d5fc4;--s4:#a16207;--s5:#be185d;--s6:#3f7f93;--s7:#5b6470;--s8:#6f4518}
 @media (prefers-color-scheme:dark){:root{--s0:#5cb3ec;--s1:#f59361;--s2:#3fc79a;--s3:#c3a2f0;--s4:#e0b13c;--s5:#f283b3;\

@@ -1,6 +1,7 @@
 """The numbers of the paper's tables (arXiv:2410.00521).
 
-The paper's suite was photographed; kpbench's suite is simulated. The title of every table with both says so.
+The paper's suite was photographed; kpbench's suite is simulated. The title of every
+table with numbers of both suites says how the images were made.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ SYNTHETIC = {
 }
 """The paper's table 2 (synthetic validation set), by the value of `deteriorate` in :class:`kpbench.SynthConfig`."""
 SYNTHETIC_RADIUS_PX = (5.0, 80.0)
-"""Smallest and largest radius, px, of a synthetic set that is comparable with table 2. They are the defaults."""
+"""Smallest and largest radius, px, of a synthetic set that is comparable with table 2: the defaults."""
 
 
 def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:

@@ -344,7 +344,7 @@ def require_report_suffix(path: Path) -> None:
     Raises
     ------
     DataError
-        If the path has another suffix or none.
+        If the path ends in none of these suffixes.
     """
     if path.suffix.lower() not in REPORT_WRITERS:
         raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_WRITERS)}")

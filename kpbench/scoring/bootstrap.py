@@ -27,7 +27,7 @@ from scipy.special import ndtr, ndtri, stdtrit
 from kpbench.types import Float, Int
 
 TAIL = 0.025
-"""Nominal probability on each side of a 95 % interval that the true value lies beyond the bound."""
+"""Nominal probability that the true value lies below a 95 % interval; equally, that it lies above the interval."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
@@ -119,7 +119,7 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
     found : float
         The statistic of all scenes.
     without_one : ndarray of shape (K,), float64
-        The jackknife: the statistic of all scenes but one, for a scene of each kind. It gives the skewness.
+        The statistic of all scenes but one, where the scene left out is of each kind in turn (jackknife).
     count : ndarray of shape (K,), int64
         Number of scenes of each kind.
     scenes : int

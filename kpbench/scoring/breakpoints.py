@@ -33,7 +33,7 @@ class Breakpoint:
         The first such crossing, interpolated linearly between rungs; None for "over" and "under".
     interval : (low, high) or None
         95 % interval of the rung from resampled scenes. A resample without such a crossing counts as the first or the
-        last rung.
+        last rung. None for fewer than two scenes, without resamples, and for "over" and "under".
 
     Examples
     --------

@@ -120,13 +120,13 @@ class _Units(NamedTuple):
     of_truth: Int
     """Unit of each true keypoint, of shape (T,)."""
     of_detection: Int
-    """Unit of each detection, or -1, of shape (D,)."""
+    """Unit of each detection, of shape (D,); -1 for a detection that belongs to no unit."""
     shared: NDArray[np.bool_]
     """Whether the unit's image has several units, of shape (M,). The image's false alarms then belong to no unit."""
 
     def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
         """Compute a group for each key; ``label`` (M,) is each unit's position in ``keys``."""
-        label_or_none = np.append(label, -1)  # a unit of -1 has the label -1
+        label_or_none = np.append(label, -1)  # the unit -1 indexes the appended label -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
         labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
         rows = [_rows_of_labels(part, len(keys)) for part in labels]

@@ -1,4 +1,4 @@
-"""Compute metrics from counts, without images or files.
+"""Compute metrics from counts, scores and distances.
 
 A metric that would be 0/0 is undefined. An undefined metric is nan in arrays and None in results, never 0 or 1.
 ``docs/reference/metrics.md`` describes each metric with its edge cases.

@@ -50,8 +50,8 @@ class Scores:
         each condition and rung and over all images. If radii fall into several bins, also the metrics of each bin.
     confusion : dict
         The identities of matched detections. ``ids`` holds the true IDs, sorted. ``matrix`` has a row per true ID and
-        a column per detected ID. The last column counts IDs that no true keypoint has, and contradicted IDs. The dict
-        is empty for a detector without identities.
+        a column per detected ID. The last column counts IDs that no true keypoint has, and contradicted IDs (see
+        :class:`kpbench.scoring.Matches`). The dict is empty for a detector without identities.
     curve : dict
         ``score`` holds score thresholds in falling order. ``precision``, ``recall`` and ``average_false_alarm`` are the
         metrics of the detections at or above each threshold. At most 201 points.
