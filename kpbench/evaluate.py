@@ -30,7 +30,7 @@ from kpbench.types import Predictions, Truth, UInt8
 DEFAULT_DATASET = Path("kpbench-data")
 """Default folder of ``kpbench synth``, and the truth if neither user nor file names a dataset that exists."""
 MOST_CASES = 12
-"""Number of failures to show in a report, divided among its detectors."""
+"""Largest number of images in the galleries of a report, divided among its detectors."""
 
 
 class LabelledImages(Protocol):

@@ -91,7 +91,7 @@ def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate 
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
-    """Tabulate detectors below the paper's table 2. ``deteriorate`` ("none" or "paper") selects the detectors' column."""
+    """Tabulate detectors below the paper's table 2. ``deteriorate``, "none" or "paper", selects the column."""
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
         rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
