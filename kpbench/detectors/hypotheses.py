@@ -18,7 +18,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""Distance of two centres, in short semi-axes. Of two hypotheses of one design that are nearer, the likelier is kept."""
+"""Distance, in short semi-axes. Of two hypotheses of one design with nearer centres, the likelier is kept."""
 
 
 class Evidence(IntEnum):
@@ -124,7 +124,7 @@ def select_likeliest(place: Int, log_odds: Float) -> Int:
 
 
 def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
-    """Return the indices of hypotheses with at least ``least_log_odds``; of near hypotheses of one design, the likelier."""
+    """Return the indices of hypotheses with at least these log odds, without worse hypotheses of one design nearby."""
     likely = np.flatnonzero(log_odds >= least_log_odds)
     kept = [np.zeros(0, np.int64)]
     for design in np.unique(hypotheses.design[likely]):

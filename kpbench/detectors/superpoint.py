@@ -166,7 +166,7 @@ def keypoint_probability(detector_logits: Float32) -> Float32:
 
 
 def _interpolate_cells(cells: Float32, xy: Float) -> Float:
-    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; cell i has its centre at 3.5 + 8i."""
+    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; cell i is centred at 3.5 + 8i."""
     _, h, w = cells.shape
     u = np.clip((xy - (CELL_PX - 1) / 2) / CELL_PX, 0, (w - 1, h - 1))
     low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
@@ -268,7 +268,7 @@ class SuperPointDetector:
     detect = __call__
 
     def batch(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Return the detections in each of several images of one size; at each scale, the network sees all images at once.
+        """Return the detections in each of several images of one size; the network sees all images of a scale at once.
 
         Raises
         ------

@@ -73,8 +73,8 @@ class AprilTagDetector:
         found = self._detector.detect(grey) if min(grey.shape) >= LEAST_APRILTAG_SIDE_PX else ()
         if not found:
             return Detections.none()
-        # The library puts (0, 0) on the outer corner of the top-left pixel. The board is drawn from OpenCV's dictionary,
-        # in which the library's tags are upside down: OpenCV's order of corners is the library's rb, lb, lt, rt.
+        # The library puts (0, 0) on the outer corner of the top-left pixel. The board is drawn from OpenCV's
+        # dictionary, in which the tags are upside down: OpenCV's order of corners is the library's rb, lb, lt, rt.
         xy = np.concatenate([tag["lb-rb-rt-lt"][[1, 0, 3, 2]] for tag in found]) - 0.5
         score = np.repeat([tag["margin"] for tag in found], 4)
         return Detections(xy, score, np.concatenate([4 * tag["id"] + np.arange(4) for tag in found]))

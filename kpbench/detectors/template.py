@@ -1,10 +1,10 @@
 """A classical detector without training, for any design with straight edges that cross at its centre.
 
-1. Crossings (:func:`find_crossings`). Straight edges that cross at a point have gradients perpendicular to the direction
-   of the point, under any perspective. A pixel is a crossing if the gradients around the pixel are so, and if these
-   gradients have more than one direction. This is a form of the operator of Förstner and Gülch, *A fast operator for
-   detection and precise location of distinct points, corners and centres of circular features*, 1987. The operator needs
-   no templates. It leaves a few hundred places.
+1. Crossings (:func:`find_crossings`). Straight edges through a point stay straight under any perspective, so their
+   gradients are perpendicular to the line to the point. A pixel is a crossing if the gradients around the pixel fulfil
+   this condition and have more than one direction. This is a form of the operator of Förstner and Gülch, *A fast
+   operator for detection and precise location of distinct points, corners and centres of circular features*, 1987. The
+   operator needs no templates. A few hundred places remain.
 2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
    at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
 3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels in the last poses.
@@ -42,7 +42,7 @@ class Thresholds:
         Standard deviation of the window of :func:`find_crossings`, px of a level. Gradients at distances of 1 to 3 px
         have the most weight.
     radial : float
-        Weight of gradients along the direction to the place, which count against a crossing.
+        Weight of gradients along the line to the place; they count against a crossing.
     octaves : int
         Number of levels of the pyramid in which crossings are searched.
     px_per_place, places : int
@@ -285,7 +285,8 @@ class TemplateDetector:
         core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
         row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
         whole = align_poses(smooth, rotated, templates.whole, TEMPLATE_THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
-        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # best rotation per candidate
+        best_rotation = np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]
+        whole = whole[best_rotation]
         alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
@@ -301,7 +302,10 @@ def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
 
 
 def _select_distinct(poses: Poses) -> Int:
-    """Return indices of poses, best first; a pose near a better pose needs another design and a similar correlation."""
+    """Return indices of poses, best first.
+
+    A pose near a better pose is kept only if it has another design and a correlation that is nearly as high.
+    """
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
     near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < TEMPLATE_THRESHOLDS.near

@@ -65,7 +65,7 @@ class Poses:
 
 
 def short_semi_axis(A: Float) -> Float:
-    """Return the short semi-axes (N,) of the ellipses that maps (N, 2, 2) make of the unit circle.
+    """Return the short semi-axes (N,) of the ellipses to which maps (N, 2, 2) take the unit circle.
 
     The short semi-axis is the smaller singular value of A: √((s − √(s² − 4d²)) / 2), with the trace s of AᵀA and the
     determinant d of A.

@@ -30,7 +30,7 @@ LEVEL_BLUR_PX = 0.6
 MODEL_REACH = 1.3
 """The outermost ring is rendered to this many times its radius, so that no blurred outer edge reaches the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
-"""Prior of the perspective: standard deviation of each entry of the bend, per px of the short semi-axis."""
+"""Prior of the perspective: standard deviation of ``bend``, per px of the short semi-axis."""
 LEAST_PIXELS = 12
 """A step needs at least this many pixels inside the patch, and at least this many pixels on edges."""
 
@@ -179,8 +179,8 @@ def _black_polygons(state: _State, patch: Patch) -> list[Float]:
 def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
     """Return the black cells of a design as polygons in the patch frame.
 
-    Coverages of cells are added, so cells that touch leave no seam. ``tolerance`` is the largest distance between arc and
-    polygon, in disc radii.
+    Coverages of cells are added, so cells that touch leave no seam. ``tolerance`` is the largest distance between arc
+    and polygon, in disc radii.
     """
     radii, angles, black = patch.cells
     radii = np.append(radii[:-1], radii[-1] * MODEL_REACH)

@@ -37,8 +37,8 @@ def rectify(
     Returns
     -------
     views : ndarray of shape (N, VIEW_PX²), float32
-        Ink, clipped to ±INK_LIMIT; nan outside the image. A least-squares line over the pixels of the disc converts grey
-        levels to ink, with white 1 and black -1.
+        Ink, clipped to ±INK_LIMIT; nan outside the image. White is 1 and black is -1, by a least-squares line over the
+        pixels of the disc.
     half_contrast : ndarray of shape (N,)
         Half the difference of white and black, grey levels, clipped to ``HALF_CONTRAST_RANGE``. The lower limit stands
         also for a white that is darker than the black.
