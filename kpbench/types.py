@@ -1,7 +1,7 @@
 """Tables that pass between the stages: true keypoints, and detections of one image and of many images.
 
-The stages that make tables and the stages that read them import only this module. The evaluator therefore never imports
-the generator.
+The stages that make tables and the stages that read tables share this module. The evaluator therefore never imports the
+generator.
 
 Coordinates are px. The centre of the top-left pixel is (0, 0), x points right and y points down.
 """

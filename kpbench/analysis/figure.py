@@ -74,7 +74,7 @@ def _icon(patch: Patch, x: float, y: float) -> list[Shape]:
 
 
 def _pixels(patch: Patch, x: float, y: float) -> list[Shape]:
-    """Return one black square per pixel of the image, with an area in proportion to the ink; surroundings are mid-grey."""
+    """Return one black square per pixel of the image, the darker the larger. The surroundings of the patch are grey."""
     half = int(WINDOW_PX) + 1
     grid = PolarGrid.of([patch])
     pose = np.array([[[WINDOW_PX, 0, 0], [0, WINDOW_PX, 0]]])

@@ -44,7 +44,8 @@ class DesignMeasures:
         Smallest distances from the design to itself rotated by 45 to 315 degrees, and to its mirror image, in ink
         contrasts.
     tilt_bias_px : float
-        Result of :func:`kpbench.analysis.tilt_bias`, at a tilt of 60 degrees.
+        Distance between the keypoint and the centre of the disc's ellipse at a tilt of 60 degrees. 0 if straight edges
+        determine the keypoint.
     black_fraction : float
         Share of the design's area that is black.
     pixels_needed : float

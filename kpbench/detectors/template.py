@@ -285,8 +285,7 @@ class TemplateDetector:
         core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
         row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
         whole = align_poses(smooth, rotated, templates.whole, TEMPLATE_THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
-        best_rotation = np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]
-        whole = whole[best_rotation]
+        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # best rotation of each
         alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
