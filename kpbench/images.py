@@ -75,7 +75,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:
-    """Raise an error if the target folder is the source, or holds the source file.
+    """Raise an error if the target is the source, or the folder of the source file.
 
     Raises
     ------

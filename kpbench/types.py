@@ -28,7 +28,7 @@ KEYPOINT_DTYPE = np.dtype(
         ("x", "<f8"),  # px, of the disc's centre
         ("y", "<f8"),
         ("patch_id", "<i2"),
-        ("radius_major", "<f4"),  # px, semi-axes of the image of the disc, an ellipse
+        ("radius_major", "<f4"),  # px, semi-axes of the disc's ellipse in the image
         ("radius_minor", "<f4"),
         ("axis_angle", "<f4"),  # degrees, direction of the major axis from +x towards +y, in [0, 180)
         ("H_patch2image", "<f8", (3, 3)),  # homography from the patch frame (unit disc) to px

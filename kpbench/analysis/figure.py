@@ -74,7 +74,7 @@ def _icon(patch: Patch, x: float, y: float) -> list[Shape]:
 
 
 def _pixels(patch: Patch, x: float, y: float) -> list[Shape]:
-    """Return one black square per pixel of the image, the darker the larger. The surroundings of the patch are grey."""
+    """Return one black square per pixel of the image, larger for a darker pixel; the surroundings are mid-grey."""
     half = int(WINDOW_PX) + 1
     grid = PolarGrid.of([patch])
     pose = np.array([[[WINDOW_PX, 0, 0], [0, WINDOW_PX, 0]]])

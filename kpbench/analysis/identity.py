@@ -1,7 +1,8 @@
 """Identity: how similar a design looks to other designs, to itself after a rotation, and to its mirror image.
 
-A distance is a root mean square in units of the ink contrast. A distance of 0.1 at a contrast of 180 grey levels is a
-difference of 18 grey levels per pixel. Noise must reach this difference before one design looks like another.
+A distance is the root mean square of a difference of images, in units of the ink contrast. A distance of 0.1 at a
+contrast of 180 grey levels is a difference of 18 grey levels per pixel. Noise must reach this difference before one
+design looks like another.
 """
 
 from __future__ import annotations

@@ -58,7 +58,8 @@ class DesignMeasures:
     basin : float
         Difference between the design and its shifted copy, in ink contrasts, see :func:`kpbench.analysis.basin`.
     natural_response, natural_response_blurred : tuple of float
-        Two shares of places in images: with a correlation with the design above 0.8, and above 0.9.
+        Shares of places in images whose correlation with the design is above 0.8, and above 0.9. The second
+        tuple is for blurred designs and images.
 
     Examples
     --------

@@ -1,8 +1,8 @@
 """Effects that degrade images, one pure function per effect; the blurs are in :mod:`kpbench.degrade.blurs`.
 
 Every function takes and returns an image of shape (H, W) or (H, W, 3), uint8, grey or RGB. The given image stays
-unchanged. No effect moves the image: the centroid of every kernel is its centre. Kernels mirror the image at
-its border, so that no edge appears. The unit of intensity is the grey level, 0 to 255.
+unchanged. No effect moves the image: the centroid of every kernel is its centre. Kernels mirror the image at its
+border, so that no edge appears. The unit of intensity is the grey level, 0 to 255.
 
 The record of an effect is a dict: the effect's name under "effect", and the arguments of the effect's function.
 :func:`kpbench.degrade.draw_effect` makes the record for a level. :func:`kpbench.degrade.apply_effects` applies records.
@@ -32,7 +32,7 @@ a fraction of the glow's strength.
 
 
 def _to_uint8(image: Any) -> UInt8:
-    """Round grey levels and clip them to 0 and 255."""
+    """Round grey levels and clip them to the range 0 to 255."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 

@@ -253,7 +253,7 @@ def draw_ladder_mix(rng: np.random.Generator, size_px: tuple[int, int], discs: D
     effects = []
     for name in (LADDER_MIX[n] for n in sorted(chosen)):
         severity = LADDER[name]
-        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # only jpeg falls, as high quality is mild
+        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # falling levels: high is mild
         level = round(harmless + float(rng.random()) * (severity.levels[-1] - harmless), 0 if name == "jpeg" else 2)
         effects.append(draw_effect(rng, name, level, size_px, discs))
     return effects

@@ -124,7 +124,10 @@ def select_likeliest(place: Int, log_odds: Float) -> Int:
 
 
 def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
-    """Return the indices of hypotheses with at least these log odds, without worse hypotheses of one design nearby."""
+    """Return the indices of distinct hypotheses with at least ``least_log_odds``.
+
+    Of near hypotheses of one design, only the likeliest is kept, see :data:`MERGE_DISTANCE`.
+    """
     likely = np.flatnonzero(log_odds >= least_log_odds)
     kept = [np.zeros(0, np.int64)]
     for design in np.unique(hypotheses.design[likely]):

@@ -133,9 +133,9 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
         called, or a class that makes such an object when it is called without arguments. Modules in the current folder
         are found.
     threshold : float, optional
-        Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own.
+        Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
-        Designs that ``template`` looks for. None: the shipped four.
+        Designs that ``template`` looks for. None: the four shipped designs.
 
     Raises
     ------

@@ -38,7 +38,7 @@ EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
 CANDIDATE_SCORE = 0.015
 """A place is verified if the network gives at least this score."""
 SCALES = (1.2, 0.5, 0.25)
-"""Scales of the image that the network sees: enlarged for small patches, shrunk for large ones."""
+"""Scales of the image that the network sees: enlarged for small patches, shrunk for large patches."""
 VERIFIED_THRESHOLD = 0.3
 """Least score of a verified detection."""
 MERGE_DISTANCE_PX = 3.0

@@ -1,4 +1,4 @@
-"""Detectors of tags, for comparison with patches; each detects the tags of one :data:`kpbench.patches.TAG_BOARDS`.
+"""Detectors of tags, for comparison with patches: one for each board of :data:`kpbench.patches.TAG_BOARDS`.
 
 Settings are the libraries' defaults, except for the settings named below. The exceptions were chosen in favour of the
 tags, on scenes of another seed than the benchmark's (docs/explanation/fairness-to-tags.md). The detectors of ArUco and
@@ -18,7 +18,7 @@ from kpbench.types import Detections, UInt8
 APRILTAG_DECIMATION = 1.5
 """Factor by which the AprilTag library shrinks the image. The library detects fewer tags with a factor of 1 or 2."""
 LEAST_APRILTAG_SIDE_PX = 8
-"""The AprilTag library crashes on an image of a few px. An image with a smaller side than this can hold no tag."""
+"""The AprilTag library crashes on an image of a few px. An image whose shorter side is below this holds no tag."""
 
 
 class ArucoDetector:

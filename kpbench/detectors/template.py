@@ -1,10 +1,10 @@
 """A classical detector without training, for any design with straight edges that cross at its centre.
 
-1. Crossings (:func:`find_crossings`). Straight edges through a point stay straight under any perspective, so their
-   gradients are perpendicular to the line to the point. A pixel is a crossing if the gradients around the pixel fulfil
-   this condition and have more than one direction. This is a form of the operator of Förstner and Gülch, *A fast
-   operator for detection and precise location of distinct points, corners and centres of circular features*, 1987. The
-   operator needs no templates. A few hundred places remain.
+1. Crossings (:func:`find_crossings`). Straight edges through a point stay straight under any perspective. The gradients
+   on these edges are perpendicular to the line to the point. A pixel is a crossing if the gradients around the pixel
+   are perpendicular to the line to the pixel, and have more than one direction. This is a form of the operator of
+   Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and centres of
+   circular features*, 1987. The operator needs no templates. A few hundred places remain.
 2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
    at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
 3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels in the last poses.

@@ -325,8 +325,8 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
     ndarray of shape (n, 2 + k)
         Column 0: log of 1 + the expected number of right hypotheses elsewhere. Column 1: log of 1 + the expected number
         of wrong hypotheses elsewhere. Other columns: difference of each column of ``shared`` from its mean over the
-        hypotheses elsewhere, weighted by their probabilities. The difference tends to 0 if the expected number of right
-        hypotheses does.
+        hypotheses elsewhere, weighted by their probabilities. The difference tends to 0 as the expected number of right
+        hypotheses tends to 0.
     """
     right = 1 / (1 + np.exp(-log_odds))
     elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]

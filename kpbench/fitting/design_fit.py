@@ -129,9 +129,9 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
 class _State:
     """One patch during the fit, in px of its level.
 
-    ``window`` is the map that the fit started from; the pixels inside this ellipse about ``xy`` count, except for a
-    margin at the rim. ``bend`` holds the first two entries of the last row of the homography. ``moved`` is the length
-    of the last step, in short semi-axes.
+    ``window`` is the map that the fit started from. With this map about ``xy``, the pixels inside the patch's extent
+    count, except for a margin at the rim. ``bend`` holds the first two entries of the last row of the homography.
+    ``moved`` is the size of the last step, in short semi-axes.
     """
 
     xy: Float

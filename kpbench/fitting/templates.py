@@ -20,7 +20,7 @@ from kpbench.types import Float, Float32, Int
 CORE_ROTATIONS = 24
 """Number of rotations of the core that are tried, and number of samples on each circle of a template."""
 WHOLE_ROTATIONS = 72
-"""Number of rotations of the whole design that are tried. The nearest is within 2.5 degrees; a fit can start there."""
+"""Number of rotations of the whole design that are tried: 5 degrees apart, which is close enough for a fit."""
 CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
 """Radii of the circles that are sampled, in radii of the core's circle and in radii of the disc."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
