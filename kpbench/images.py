@@ -18,8 +18,8 @@ from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, write_atomic
 from kpbench.types import UInt8
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
-DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # of a single image that is written
-DEFAULT_FPS = 25.0  # of a camera that names no frame rate
+DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # of a single image into which detections are drawn
+DEFAULT_FPS = 25.0  # frames per second, of a video or camera that states no frame rate
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class ImageSource:
     Attributes
     ----------
     images : iterator of (str, ndarray or None)
-        Name and pixels of each image; None for a file that cannot be decoded.
+        Name and pixels of each image. The pixels of a file that cannot be decoded are None.
     length : int or None
         Number of images; None if unknown, as for a camera.
     fps : float or None
@@ -44,8 +44,8 @@ class ImageSource:
 def open_images(source: str, exclude: Path | None = None) -> ImageSource:
     """Open ``camera:N``, a video file, an image file, or a folder of images.
 
-    Images of a folder come in the order of their names, those of its subfolders included. Images below the folder
-    ``exclude`` are left out.
+    The images of a folder and of its subfolders come in the order of their paths. Images below the folder ``exclude``
+    are left out.
 
     Raises
     ------
@@ -75,12 +75,12 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:
-    """Raise an error if the target folder is the source, or holds the source file.
+    """Raise an error if the target is the source, or the folder of the source file.
 
     Raises
     ------
     DataError
-        The message names the target.
+        If the images would be overwritten.
     """
     given = Path(source).resolve()
     if target.resolve() in (given, *([given.parent] if given.is_file() else [])):
@@ -117,10 +117,10 @@ def _open_video(capture: cv2.VideoCapture, name: str, length: int | None) -> Ima
 def image_writer(
     target: Path | None, count: int | None, fps: float | None = None
 ) -> Iterator[Callable[[str, UInt8], None]]:
-    """Give a function that writes RGB images under their names.
+    """Yield a function that writes RGB images under their names.
 
-    The target decides the form: a folder of PNG files, one video (.mp4), or one image (.png, .jpg). No target writes
-    nothing.
+    The target decides the form: a folder of PNG files, one video (.mp4), or one image (.png, .jpg). With no target,
+    nothing is written.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ def image_writer(
 
 @contextmanager
 def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], None]]:
-    """Give a function that appends a frame to a video, which is written whole or not at all.
+    """Yield a function that appends a frame to a video. The video is written whole or not at all.
 
     OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
     """
@@ -196,7 +196,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
 
 
 def resize(grey: UInt8, width: int, height: int) -> UInt8:
-    """Return a grey image in another size; the outer corners of its corner pixels keep their places."""
+    """Return a grey image in another size. The outer corners of the two images coincide."""
     if grey.shape == (height, width):
         return grey
     how = cv2.INTER_CUBIC if width > grey.shape[1] else cv2.INTER_AREA
@@ -204,7 +204,7 @@ def resize(grey: UInt8, width: int, height: int) -> UInt8:
 
 
 def to_grey(image: UInt8) -> UInt8:
-    """Return an image (H, W) or RGB (H, W, 3) as grey (H, W).
+    """Return a grey (H, W) or RGB (H, W, 3) image as grey (H, W).
 
     Raises
     ------
@@ -219,7 +219,7 @@ def to_grey(image: UInt8) -> UInt8:
 def decode_photo(path: Path, channels: int) -> UInt8 | None:
     """Return a photograph as grey (``channels`` 1) or RGB (``channels`` 3), not rotated by its EXIF data.
 
-    None stands for a file that cannot be decoded, or whose image has a side under 8 px.
+    Return None if the file cannot be decoded, or the image has a side under 8 px.
     """
     flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:

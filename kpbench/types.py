@@ -1,6 +1,7 @@
 """Tables that pass between the stages: true keypoints, and detections of one image and of many images.
 
-The tables stand below the stages that make and read them. The evaluator therefore never imports the generator.
+The stages that make tables and the stages that read tables share this module. The evaluator therefore never imports the
+generator.
 
 Coordinates are px. The centre of the top-left pixel is (0, 0), x points right and y points down.
 """
@@ -27,9 +28,9 @@ KEYPOINT_DTYPE = np.dtype(
         ("x", "<f8"),  # px, of the disc's centre
         ("y", "<f8"),
         ("patch_id", "<i2"),
-        ("radius_major", "<f4"),  # px, semi-axes of the ellipse that the disc is in the image
+        ("radius_major", "<f4"),  # px, semi-axes of the disc's ellipse in the image
         ("radius_minor", "<f4"),
-        ("axis_angle", "<f4"),  # degrees from +x towards +y, of the major axis, in [0, 180)
+        ("axis_angle", "<f4"),  # degrees, direction of the major axis from +x towards +y, in [0, 180)
         ("H_patch2image", "<f8", (3, 3)),  # homography from the patch frame (unit disc) to px
         ("visible", "<f4"),  # fraction of the disc that lies inside the image and is not occluded
         ("contrast", "<f4"),  # grey levels, white minus black, after deterioration
@@ -157,7 +158,7 @@ class InvalidValue(PredictionsError):
     image_id : int
         Identity of the image.
     problem : str
-        The value and what was expected, without the place.
+        The impossible value and the expected value, without their place in the table.
     """
 
     def __init__(self, image: int, keypoint: int | None, image_id: int, problem: str) -> None:

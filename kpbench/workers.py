@@ -33,9 +33,9 @@ Progress = Callable[[int], None]
 """A function that is called with the number of images finished since its last call."""
 
 PROGRESS_INTERVAL_S = 0.2
-"""Longest time between two reports of progress, s: a progress bar moves smoothly."""
+"""Longest time between two reports of progress, s, so that a progress bar moves smoothly."""
 JOBS_AHEAD = 4
-"""Jobs per worker process that :func:`run_in_order` submits before their results are asked for."""
+"""Number of jobs per worker process that :func:`run_in_order` submits before their results are asked for."""
 WORKER_DIED = "a worker process died (out of memory?)"
 
 
@@ -56,10 +56,11 @@ def run_jobs(
     Parameters
     ----------
     work : callable
-        Called as ``work(job, progress)``. It must be picklable. It reports its own finished images to ``progress``.
+        Called as ``work(job, progress)``. ``work`` must be picklable. ``work`` reports its own finished images to its
+        argument ``progress``.
     jobs : sequence
     workers : int or None
-        Number of worker processes, None for one per core. With 1, the jobs run in this process.
+        Number of worker processes; None for one per core. With 1, the jobs run in this process, in order.
     progress : callable
         Called in this process with the number of images finished since its last call.
     executor : concurrent.futures.Executor, optional
@@ -115,12 +116,12 @@ def _run_in_processes(
 def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers: int) -> Iterator[ResultT]:
     """Yield the result of every job in the order of the jobs; worker processes work a few jobs ahead.
 
-    Jobs are taken one by one as results are asked for, so that their number may be infinite.
+    Jobs are taken one by one as results are asked for, so ``jobs`` may be infinite.
 
     Parameters
     ----------
     work : callable
-        Called as ``work(job)``. It must be picklable.
+        Called as ``work(job)``. ``work`` must be picklable.
     jobs : iterable
     workers : int
         Number of worker processes. With 0, each job runs in this process when its result is asked for.
@@ -145,14 +146,14 @@ def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers:
 
 @contextmanager
 def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
-    """Start worker processes; yield their pool and a counter of finished images that they share.
+    """Start worker processes; yield their pool, and the counter of finished images that the processes share.
 
     The processes are killed if the block ends early: by an error, or because no more results are asked for.
     """
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV, HDF5 or torch may hang
     counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    pool.submit(int)  # this first job starts all processes, so that the next line finds them
+    pool.submit(int)  # an empty first job starts all processes, so that the next line finds them
     processes = set(multiprocessing.active_children()) - others
     try:
         yield pool, counter
@@ -163,7 +164,7 @@ def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
             raise DataError(WORKER_DIED) from None
         raise
     finally:
-        # the pool has its own thread, which must end before Python exits, also after the death of a worker
+        # the pool's own thread must end before Python exits, even if a worker died
         pool.shutdown(wait=True, cancel_futures=True)
 
 
@@ -210,13 +211,13 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
 
 def use_one_thread() -> None:
-    """Make OpenCV and BLAS use one thread in this process; on small matrices, more threads cost more than they save."""
+    """Make OpenCV and BLAS use one thread in this process; on small matrices, more threads take more time."""
     cv2.setNumThreads(1)
     threadpool_limits(1)
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Make BLAS use one thread within a ``with`` block; further threads would wait busily and slow other work down."""
+    """Make BLAS use one thread within a ``with`` block; more threads would wait busily and slow other work down."""
     limit: AbstractContextManager[Any] = _threadpool_controller().limit(limits=1, user_api="blas")
     return limit
 
@@ -245,7 +246,7 @@ _counter: Any = None
 def _start_worker(counter: Any) -> None:
     """Prepare a new worker process: use one thread, ignore signals, and end with the parent process.
 
-    Ctrl-C and batch systems send their signal to every process of a run. The parent alone decides what to do.
+    Ctrl-C and batch systems send their signal to every process of a run. The parent process alone reacts to the signal.
     """
     global _counter
     _counter = counter
@@ -279,7 +280,7 @@ def _run_counted(work: Callable[[JobT, Progress], ResultT], job: JobT) -> Result
 
 
 def _run_remote(work: Callable[[JobT, Progress], ResultT], job: JobT) -> tuple[ResultT, int]:
-    """Run a job where no counter is shared; return its result and its number of finished images."""
+    """Run a job in a worker that shares no counter; return the result and the number of finished images."""
     total = 0
 
     def add_to_total(images: int) -> None:

@@ -1,4 +1,4 @@
-"""Measures of designs: how well they are located, told apart, and told from natural images; the search for the best.
+"""Measures of designs: localisation, identity and look-alikes in natural images; the search for the best designs.
 
 Examples
 --------

@@ -1,4 +1,4 @@
-"""The analysis of designs in one call: sample backgrounds, search or measure, write the JSON file and the figure."""
+"""The analysis of designs in one call: measure given designs or search for the best, and write the results."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class AnalysisRun:
     patches : tuple of Patch
         The designs that were measured: the given designs, or the best set of the search.
     analysis : Analysis
-        Their measures.
+        Measures of ``patches``.
     search : SearchResult or None
-        None without a search.
+        None if no search was run.
 
     Examples
     --------
@@ -65,13 +65,14 @@ def analyse_patches(
         Whether to repeat the search that chose the shipped designs, and to measure the best set. ``patches`` must then
         be left out.
     backgrounds : str or Path, optional
-        Folder of photographs in which places are counted that look like a design. Procedural backgrounds if left out.
+        Folder of photographs. The places in the photographs that look like a design are counted. Procedural
+        backgrounds if left out.
     json_file : str or Path, optional
         File for all measures.
     figure_file : str or Path, optional
-        File for one page with the designs and their measures: .svg, .png or .pdf.
+        .svg, .png or .pdf file for one page with the designs and their measures.
     progress : callable
-        Called with the number of steps since the call before, :func:`count_steps` in all.
+        Called with the number of steps finished since the last call, :func:`count_steps` in all.
 
     Returns
     -------
@@ -80,7 +81,7 @@ def analyse_patches(
     Raises
     ------
     DesignError
-        If the suffix of the figure is unknown, or ``patches`` and ``search_family`` are both given.
+        If the figure's name does not end in .svg, .png or .pdf, or ``patches`` and ``search_family`` are both given.
     DataError
         If the folder holds no photograph, or a file cannot be written.
 

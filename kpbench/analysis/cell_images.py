@@ -7,10 +7,10 @@ matrices with the vector of its inks. A whole family of designs can be measured 
 Conventions
 -----------
 * An ink is 1 for black and 0 for white.
-* An *attitude* is a 2x2 matrix from the unit disc to px: a rotation and a foreshortening. A patch is small, and
+* An *attitude* is a 2x2 matrix from the unit disc to px: a rotation and a foreshortening. A patch is small, so the
   perspective within the patch is left out.
-* The *window* is a disc of :data:`WINDOW_PX` radius about the keypoint. Only windows are compared. A window that shows
-  the fraction ``seen`` of the patch's radius stands for a patch of ``WINDOW_PX / seen`` radius.
+* The *window* is a disc of :data:`WINDOW_PX` radius about the keypoint. Only the pixels of the window are compared. If
+  the window shows the fraction ``seen`` of the patch's radius, the patch has a radius of ``WINDOW_PX / seen`` px.
 * The outermost ring continues outside the patch. Differences between designs therefore never come from a background.
 * Blur is Gaussian. Its standard deviation is given as a fraction of the window's radius.
 """
@@ -30,16 +30,16 @@ from kpbench.types import Float, Float32
 
 TILTS_DEG = (0.0, 30.0, 60.0)
 TILT_DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # directions in the image along which a tilted patch is foreshortened
-TURNS = 24  # rotations in the plane that are compared, 15 degrees apart
+TURNS = 24  # number of rotations in the plane that are compared, 15 degrees apart
 WINDOW_PX = 5.0  # radius of the window
 BLUR = 0.2  # standard deviation, as a fraction of the window's radius
-HALF_SIDE_PX = int(WINDOW_PX) + 1  # half the side of the square around the window
-BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # around the square, for the blur
+HALF_SIDE_PX = int(WINDOW_PX) + 1  # half the side of the square around the window, without the middle px
+BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # margin around the square, for the blur
 
 
 @dataclass(frozen=True)
 class PolarGrid:
-    """Rings and sectors of a polar chequer on which several designs fit.
+    """Rings and sectors of a polar chequer that several designs share.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class PolarGrid:
 
     @classmethod
     def of(cls, patches: Sequence[Patch]) -> PolarGrid:
-        """Return the coarsest grid on which all the designs and their mirror images fit."""
+        """Return the coarsest grid whose cells each have one ink in every design and every mirror image."""
         radii = np.unique(np.round(np.concatenate([p.cells[0][1:] for p in patches]), 9))
         angles = np.concatenate([p.cells[1] for p in patches])
         angles = np.unique(np.round(np.append(angles, -angles) % 360.0, 9) % 360.0)
@@ -96,7 +96,7 @@ class PolarGrid:
         return np.array(rows, np.float32)
 
     def mirror_inks(self, inks: Float32) -> Float32:
-        """Return the inks of the mirror images, shape (n, cells); the grid's angles must be symmetric about 0."""
+        """Return the inks of the mirror images, shape (n, cells). The grid's angles must be symmetric about 0."""
         middle = self.middles()[1] % 360.0
         order = [int(np.argmin(np.abs((middle + a + 180.0) % 360.0 - 180.0))) for a in middle]
         return inks.reshape(len(inks), *self.shape)[:, :, order].reshape(len(inks), -1)
@@ -104,14 +104,14 @@ class PolarGrid:
     def cell_polygons(self, tolerance: float, reach: float = 0.0) -> list[Float]:
         """Return every cell as a polygon of the patch frame.
 
-        Neighbours share the vertices of their common border. Cells of one ink therefore add up without a seam.
+        Neighbours share the vertices of their common border, so cells of one ink add up without a seam.
 
         Parameters
         ----------
         tolerance : float
             Largest distance between an arc and its chords, in disc radii, see :func:`kpbench.geometry.flatten`.
         reach : float
-            The outermost ring is extended to this radius if the radius is larger.
+            Least radius to which the outermost ring extends, in disc radii.
         """
         radii = np.append(0.0, self.radii)
         radii[-1] = max(radii[-1], reach)
@@ -144,13 +144,14 @@ def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Flo
     turns : int
         Number of rotations in the plane, evenly spaced over a full turn.
     tilts_deg : sequence of float
-        Angles between the optical axis and the normal of the patch. A tilt is taken in each of
-        :data:`TILT_DIRECTIONS_DEG`.
+        Angles between the optical axis and the normal of the patch. Each tilt other than 0 occurs in every direction
+        of :data:`TILT_DIRECTIONS_DEG`.
 
     Returns
     -------
     ndarray of shape (P, 2, 2)
-        Matrices from the unit disc to px, for a patch of 1 px radius. Attitudes that are not rotated come first.
+        Matrices from the unit disc to px, for a patch of 1 px radius. Attitudes without rotation in the plane come
+        first.
 
     Examples
     --------
@@ -182,11 +183,11 @@ def render_polygons(
     poses : ndarray of shape (P, 2, 3)
         Affine maps ``[A | shift]`` from the frame of the polygons to px.
     half : int
-        The side of the square is ``2 * half + 1`` px. The origin is its middle.
+        The side of the square is ``2 * half + 1`` px. The origin is the middle of the square.
     blur_px : float
-        Standard deviation of a Gaussian; 0 for none.
+        Standard deviation of a Gaussian blur; 0 for none.
     mix : ndarray of shape (M, len(polygons)), optional
-        Weights. The result then holds M weighted sums of the polygons instead of the polygons.
+        Weights. The result then holds M weighted sums of coverages instead of the coverage of each polygon.
 
     Returns
     -------
@@ -213,7 +214,7 @@ def render_polygons(
 def blur_middle(stack: Float32, blur_px: float, half: int) -> Float32:
     """Return the middle ``2 * half + 1`` rows and columns of blurred square images, shape (N, side, side).
 
-    The images are large enough for the kernel. No border therefore enters the result.
+    The images must be large enough that no kernel reaches beyond their borders.
     """
     wide = stack.shape[1] // 2
     if not blur_px:
@@ -241,9 +242,9 @@ def render_cells(
     seen : float
         Fraction of the patch's radius that the window shows.
     shift_px : (float, float)
-        Place of the keypoint relative to the middle of the window.
+        Offset of the keypoint from the middle of the window, px.
     blur : float
-        As a fraction of the window's radius.
+        Standard deviation of the blur, as a fraction of the window's radius.
     """
     farthest = np.hypot(HALF_SIDE_PX + BLUR_MARGIN_PX, HALF_SIDE_PX + BLUR_MARGIN_PX) + np.hypot(*shift_px) + 2
     reach = farthest * seen / WINDOW_PX / np.linalg.svd(attitude, compute_uv=False).min()
@@ -259,7 +260,7 @@ def window_weights(attitude: Float) -> Float32:
 
 
 def mean_free_images(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
-    """Return the images of designs minus their weighted mean, shape (n, pixels), and standard deviations, (n,)."""
+    """Return designs' images minus their weighted means, shape (n, pixels), and weighted standard deviations, (n,)."""
     image = inks @ cells
     image -= (image @ weight)[:, None]
     spread: Float32 = np.sqrt(np.maximum((image * image) @ weight, np.float32(1e-9)))

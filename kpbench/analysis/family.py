@@ -1,9 +1,9 @@
 """The family of designs among which the search chooses.
 
 A design of the family has up to three semi-circles with radii of 1, 2/3, 1/2 or 1/3 and angles in steps of 45 degrees.
-They are painted black, white or inverting onto a black or a white disc. The cells of a design are four rings by eight
-sectors. A design is therefore a code of 32 bits: bit ``8 * ring + sector`` is 1 where the cell is black. Rotations and
-mirror images of a design count as one design.
+The semi-circles are painted onto a black or a white disc; a semi-circle is black, white or inverts the ink below. The
+cells of a design are four rings by eight sectors. A design is therefore a code of 32 bits: bit ``8 * ring + sector`` is
+1 if the cell is black. The rotations and mirror images of a design count as one design.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ STROKES = _strokes()
 
 
 def paint_semicircle(codes: Codes, stroke: int) -> Codes:
-    """Return the designs with one more semi-circle: an index into :data:`STROKES`."""
+    """Return the designs with one more semi-circle; ``stroke`` is its index in :data:`STROKES`."""
     semicircle, bits = STROKES[stroke]
     if semicircle.ink == "invert":
         return codes ^ bits
@@ -77,7 +77,7 @@ def code_of(patch: Patch) -> int:
 
 @dataclass(frozen=True)
 class Family:
-    """All designs that can be painted, with the shortest way to paint each.
+    """All designs that can be painted, each with the fewest semi-circles that paint the design.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Family:
 
     @cached_property
     def classes(self) -> Codes:
-        """One code for each class of rotations and mirror images, ascending."""
+        """Canonical codes of the designs, without repetition, ascending."""
         return np.unique(canonical_codes(self.codes))
 
     def patch(self, code: int, name: str, patch_id: int) -> Patch:
@@ -108,7 +108,7 @@ class Family:
 
 
 def enumerate_family() -> Family:
-    """Paint every design of the family, first the designs with the fewest semi-circles.
+    """Paint every design of the family, in order of the number of semi-circles.
 
     Examples
     --------

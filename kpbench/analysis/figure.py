@@ -18,11 +18,11 @@ PAGE_WIDTH = 210.0  # all lengths in mm
 ROW, TOP, LEFT = 42.0, 14.0, 6.0  # height of a row, beginning of the first row, beginning of the first column
 FONT = 2.6
 ICON = 13.0  # radius of the outline of a design
-DOT = 1.9  # side of a pixel of the image, if the pixel is black
+DOT = 1.9  # side of the square for a black pixel of the image
 BAR, BAR_STEP = 36.0, 4.6  # length of a full bar, and distance between the beginnings of two bars
 BARS_X, PAIRS_X = 82.0, 146.0  # beginning of the column of measures, and of the column of other designs
-FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # values of a full bar
-MOST_OTHERS = 6  # other designs that a row has room for
+FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # values for which a bar has its full length
+MOST_OTHERS = 6  # largest number of other designs in a row
 
 
 def draw_designs(analysis: Analysis, patches: Sequence[Patch]) -> Page:
@@ -74,7 +74,7 @@ def _icon(patch: Patch, x: float, y: float) -> list[Shape]:
 
 
 def _pixels(patch: Patch, x: float, y: float) -> list[Shape]:
-    """Return a black square per pixel of the image, the larger the darker; the surroundings are mid-grey."""
+    """Return one black square per pixel of the image, larger for a darker pixel; the surroundings are mid-grey."""
     half = int(WINDOW_PX) + 1
     grid = PolarGrid.of([patch])
     pose = np.array([[[WINDOW_PX, 0, 0], [0, WINDOW_PX, 0]]])

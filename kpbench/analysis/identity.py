@@ -1,7 +1,8 @@
-"""Identity: how similar designs look to each other, to themselves after a rotation, and to their mirror images.
+"""Identity: how similar a design looks to other designs, to itself after a rotation, and to its mirror image.
 
-A distance is a root mean square in units of the ink contrast. A distance of 0.1 at a contrast of 180 grey levels is a
-difference of 18 grey levels per pixel. Noise must reach this difference to make one design look like another.
+A distance is the root mean square of a difference of images, in units of the ink contrast. A distance of 0.1 at a
+contrast of 180 grey levels is a difference of 18 grey levels per pixel. Noise must reach this difference before one
+design looks like another.
 """
 
 from __future__ import annotations
@@ -31,19 +32,19 @@ IDENTITY_STEPS = len(PARTS_OF_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(TILT_D
 def correlation_and_distance(
     grid: PolarGrid, inks: Float32, progress: Callable[[int], None] = lambda steps: None
 ) -> tuple[Float32, Float32]:
-    """Return how similar designs can look, over all pairs of attitudes.
+    """Return how similar each pair of designs can look.
 
-    The first design is seen, blurred, in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`. The second
-    design has the attitude, the positive gain and the offset with the best match, and is replaced by its mirror image
-    if that matches better. The worst of the fractions :data:`PARTS_OF_IDENTITY` of the patch in the window counts. Both
-    results are symmetric: the worse of the two orders counts.
+    The first design is blurred and seen in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`. The second
+    design, or its mirror image, is seen in the attitude that matches best, with the best positive gain and offset. Each
+    comparison is made for every fraction :data:`PARTS_OF_IDENTITY` of the patch in the window. The most similar case
+    counts. Each pair is compared in both orders, so both results are symmetric.
 
     Parameters
     ----------
     grid : PolarGrid
     inks : ndarray of shape (n, cells), float32
     progress : callable
-        Called with the number of steps since the call before, :data:`IDENTITY_STEPS` in all.
+        Called with the number of steps finished since the last call, :data:`IDENTITY_STEPS` in all.
 
     Returns
     -------
@@ -87,7 +88,7 @@ def correlation_and_distance(
 
 
 def turned_distance(grid: PolarGrid, inks: Float32) -> Float:
-    """Return the smallest distance of each design to itself rotated by 45 degrees or more, shape (n,)."""
+    """Return the smallest distance of each design to itself rotated by 45 to 315 degrees, shape (n,)."""
     return _distance_over_turns(grid, inks, inks, range(TURNS // 8, TURNS - TURNS // 8 + 1))
 
 
@@ -110,7 +111,7 @@ def _distance_over_turns(grid: PolarGrid, inks: Float32, others: Float32, turns:
 def symmetry_order(patch: Patch) -> int:
     """Return the number of rotations within a full turn that leave the print unchanged.
 
-    1 means that the orientation is unique, 0 that every rotation leaves the print unchanged.
+    1 means that the orientation is unique. 0 means that every rotation leaves the print unchanged.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Localisation: how exactly the image of a design determines the centre."""
+"""Localisation: how exactly the image of a design determines its centre."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from kpbench.types import Float, Float32
 NOISE = 10.0  # grey levels, standard deviation of the noise in a pixel
 CONTRAST = 180.0  # grey levels, white minus black
 PARTS_OF_BASIN = (1.0, 1 / 2, 1 / 3)  # fractions of the patch's radius that the window shows
-SHIFT = 0.25  # as a fraction of the window's radius
+SHIFT = 0.25  # of a design against itself, as a fraction of the window's radius
 SHIFT_DIRECTIONS = 8
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Cramér-Rao bound of the centre of a design, over all directions of the tilt.
+    """Cramér-Rao bound of the centre of a design, for the worst direction of the tilt.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class Bound:
     blur : float
         Standard deviation of the blur, in disc radii.
     worst_px : float
-        Standard deviation of the centre in its worst direction.
+        Largest standard deviation of the centre over all directions in the image.
     rms_px : float
         Root mean square of the standard deviations along x and y.
 
@@ -65,9 +65,9 @@ def point_bound(
     """Return the Cramér-Rao bound of the point at the origin of the cells, at :data:`NOISE` and :data:`CONTRAST`.
 
     There are 8 unknowns: the point, the 2x2 affine deformation and both inks. Derivatives are central differences of
-    exact images. The Fisher information of a Gaussian is ``F = J Jᵀ`` for derivatives J divided by the noise (S. Kay,
-    *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, eq. 3.31). A known mid-grey surrounds the
-    cells.
+    exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided by
+    the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
+    1993, eq. 3.31). The cells are surrounded by a known mid-grey.
 
     Parameters
     ----------
@@ -78,15 +78,15 @@ def point_bound(
     attitude : ndarray of shape (2, 2)
         Matrix from the frame of the cells to px.
     blur_px : float
-        Standard deviation of a Gaussian.
+        Standard deviation of a Gaussian blur.
     rim : bool
-        Whether pixels count that lie partly outside the cells. False stands for an unknown background.
+        Whether pixels that lie partly outside the cells count. False stands for an unknown background.
 
     Returns
     -------
     worst_px, rms_px : ndarray of shape (n,)
-        Standard deviation in the worst direction, and the root mean square over x and y. Both are infinite if the image
-        does not determine the point.
+        Standard deviation in the worst direction, and root mean square of the standard deviations along x and y. Both
+        are infinite if the image does not determine the point.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def point_bound(
     >>> round(float(worst_px[0]), 3)
     0.012
     """
-    step = 0.02  # px, of the central differences
+    step = 0.02  # px, step of the central differences
     base = np.column_stack([attitude, np.zeros(2)])
     size = max(np.linalg.norm(np.concatenate(list(cells)), axis=1).max(), 1e-9)
     poses = [base]
@@ -123,7 +123,7 @@ def point_bound(
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
     F = J @ J.transpose(0, 2, 1)
     nuisance = np.linalg.pinv(F[:, 2:, 2:], rcond=1e-7, hermitian=True)
-    # Schur complement: the information on the point that is left when the other six unknowns are estimated too
+    # Schur complement: the information on the point if the other six unknowns are estimated too
     centre = F[:, :2, :2] - F[:, :2, 2:] @ nuisance @ F[:, 2:, :2]
     information = np.linalg.eigvalsh(centre)
     known = information > 1e-5 * F[:, :2, :2].trace(axis1=1, axis2=2)[:, None]
@@ -175,10 +175,10 @@ def design_bound(
 def basin(grid: PolarGrid, inks: Float32) -> Float:
     """Return how much each design differs from itself at a small shift.
 
-    A blurred patch is compared with itself shifted by :data:`SHIFT` of the window's radius. The difference that remains
-    after the best gain and offset is a root mean square in units of the ink contrast. The result is the difference in
-    the worst of eight directions of the shift, for the most similar attitude, and for the worst of the fractions
-    :data:`PARTS_OF_BASIN` of the patch in the window.
+    A blurred patch is compared with itself, shifted by :data:`SHIFT` of the window's radius. The comparison is made for
+    eight directions of the shift, for every attitude of the shifted patch, and for every fraction
+    :data:`PARTS_OF_BASIN` of the patch in the window. The difference is a root mean square after the best gain and
+    offset, in units of the ink contrast. The smallest difference is returned.
 
     Parameters
     ----------
@@ -215,11 +215,11 @@ def basin(grid: PolarGrid, inks: Float32) -> Float:
 
 
 def tilt_bias(patch: Patch, radius_px: float = 45.0, tilt_deg: float = 60.0) -> float:
-    """Return the distance in px between the keypoint and the centre of the patch's arcs, in a tilted view.
+    """Return the distance in px between the keypoint and the centre of the disc's ellipse, in a tilted view.
 
-    The distance is 0 if straight edges cross at the keypoint. Otherwise arcs alone determine the centre, at least along
-    an edge, and the centre of an ellipse is not the image of the circle's centre. The camera is the paper's (1624x1240,
-    focal length 889 px).
+    The ellipse's centre is not the image of the disc's centre. If straight edges cross at the keypoint, they determine
+    the keypoint, and 0 is returned. Otherwise arcs alone determine the keypoint in at least one direction. The camera
+    is the paper's (1624x1240, focal length 889 px).
     """
     if patch.centre_is_crossing:
         return 0.0

@@ -39,24 +39,27 @@ class DesignMeasures:
     centre_is_crossing : bool
         See :attr:`kpbench.Patch.centre_is_crossing`.
     symmetry_order : int
-        Number of rotations that leave the print unchanged; 0 for all.
+        Number of rotations that leave the print unchanged; 0 if every rotation does.
     turned_distance, mirrored_distance : float
-        Smallest distance to itself rotated by 45 degrees or more, and to its mirror image, in ink contrasts.
+        Smallest distances from the design to itself rotated by 45 to 315 degrees, and to its mirror image, in ink
+        contrasts.
     tilt_bias_px : float
-        Distance between the keypoint and the centre of the arcs at a tilt of 60 degrees.
+        Distance between the keypoint and the centre of the disc's ellipse at a tilt of 60 degrees. 0 if straight edges
+        determine the keypoint.
     black_fraction : float
-        Share of black ink.
+        Share of the design's area that is black.
     pixels_needed : float
         Radius of the disc in px at which the smallest region holds a circle of 2 px diameter.
     bounds : tuple of Bound
         One per size, tilt and blur.
     bound_without_rim_px : float
-        Bound in the worst direction at 5 px radius on an unknown background. Infinite if the inside of the disc alone
+        Bound in the worst direction at 5 px radius on an unknown background. Infinite if the inside of the patch alone
         does not determine the centre.
     basin : float
-        Difference to itself at a small shift, in ink contrasts.
+        Difference between the design and its shifted copy, in ink contrasts, see :func:`kpbench.analysis.basin`.
     natural_response, natural_response_blurred : tuple of float
-        Shares of places in images whose correlation with the design is greater than 0.8 and than 0.9.
+        Shares of places in images whose correlation with the design is above 0.8, and above 0.9. The second
+        tuple is for blurred designs and images.
 
     Examples
     --------
@@ -87,7 +90,7 @@ class DesignMeasures:
         return sorted({bound.radius_px for bound in self.bounds})
 
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
-        """Return the bound for a size, a tilt and a blur that were computed."""
+        """Return the bound of a size, tilt and blur that is in ``bounds``."""
         wanted = (radius_px, tilt_deg, blur)
         return next(b for b in self.bounds if (b.radius_px, b.tilt_deg, b.blur) == wanted)
 
@@ -115,7 +118,7 @@ class Analysis:
     distance: Float32
 
     def nearest(self, n: int) -> tuple[str, float]:
-        """Return name and distance of the design that is most similar to design n; ("", inf) if there is no other."""
+        """Return name and distance of the design most similar to design n; ("", inf) if there is no other design."""
         others = np.where(np.arange(len(self.designs)) == n, np.inf, self.distance[n])
         closest = int(np.argmin(others))
         return (self.designs[closest].name, float(others[closest])) if len(others) > 1 else ("", float("inf"))
@@ -161,7 +164,7 @@ def measure_designs(
     windows : ndarray of shape (N, side, side), uint8
         From :func:`kpbench.analysis.background_windows`.
     progress : callable
-        Called with the number of steps since the call before, :data:`MEASURE_STEPS` in all.
+        Called with the number of steps finished since the last call, :data:`MEASURE_STEPS` in all.
     """
     grid = PolarGrid.of(patches)
     inks = grid.inks(patches)
@@ -209,7 +212,7 @@ def pixels_needed(grid: PolarGrid, inks: Float32, samples: int = 128) -> Float:
     grid : PolarGrid
     inks : ndarray of shape (n, cells), float32
     samples : int
-        Regions are found on a raster of this many samples per diameter.
+        Number of samples per disc diameter on which regions are found.
 
     Returns
     -------

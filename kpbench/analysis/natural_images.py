@@ -22,8 +22,8 @@ from kpbench.analysis.cell_images import (
 from kpbench.render.background import PhotoFolder, procedural_background
 from kpbench.types import Float, Float32, UInt8
 
-LOOKS_ALIKE = (0.8, 0.9)  # correlations from which a place looks like a design
-LEAST_SPREAD = 8.0  # grey levels: a window with a smaller standard deviation looks like no design
+LOOKS_ALIKE = (0.8, 0.9)  # a place looks like a design if its correlation is above these thresholds
+LEAST_SPREAD = 8.0  # grey levels; a window with a smaller standard deviation looks like no design
 WINDOWS = 20_000
 WINDOWS_PER_IMAGE = 200
 BACKGROUND_PX = (640, 480)
@@ -31,7 +31,7 @@ BACKGROUND_PX = (640, 480)
 
 
 def background_windows(backgrounds: str | Path | None = None) -> UInt8:
-    """Return windows at random places of photographs or of procedural backgrounds, the same windows in every call.
+    """Return windows at random places of photographs or procedural backgrounds. Every call gives the same windows.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def _procedural(rng: np.random.Generator) -> Iterator[UInt8]:
 
 
 def _photographs(folder: PhotoFolder, rng: np.random.Generator) -> Iterator[UInt8]:
-    """Yield the photographs of a folder in a random order, without end; each pass has the same order."""
+    """Yield the photographs of a folder without end, in a random order that is the same in every pass."""
     order = rng.permutation(len(folder.files))
     while True:
         for n in order:
@@ -78,12 +78,12 @@ def _photographs(folder: PhotoFolder, rng: np.random.Generator) -> Iterator[UInt
 
 
 def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count: int = WINDOWS) -> UInt8:
-    """Return windows at random places of images at full, half and quarter size.
+    """Return windows at random places of images, each image at full, half or quarter size.
 
     Parameters
     ----------
     photographs : iterable of ndarray of shape (H, W), uint8
-        Grey images. They are read until there are enough windows, :data:`WINDOWS_PER_IMAGE` per image.
+        Grey images. Each image gives :data:`WINDOWS_PER_IMAGE` windows. Images are read until there are enough windows.
     rng : numpy.random.Generator
     count : int
         Number of windows.
@@ -91,7 +91,7 @@ def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count
     Returns
     -------
     ndarray of shape (count, side, side), uint8
-        Squares around the window, with a margin for a blur. There are fewer if the images run out.
+        Squares around the windows, with a margin for a blur. There are fewer squares if the images run out.
 
     Examples
     --------
@@ -117,7 +117,7 @@ def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count
 
 
 def natural_response(grid: PolarGrid, inks: Float32, windows: UInt8, blur: float = 0.0) -> Float:
-    """Return the share of places in images that look like each design in some attitude.
+    """Return, for each design, the share of image windows that look like the design in some attitude.
 
     Parameters
     ----------
@@ -131,8 +131,8 @@ def natural_response(grid: PolarGrid, inks: Float32, windows: UInt8, blur: float
     Returns
     -------
     ndarray of shape (n, 2), float64
-        Shares of the windows whose correlation is greater than 0.8 and than 0.9. A window with a standard deviation
-        under 8 grey levels never counts.
+        Shares of the windows with a correlation above 0.8, and above 0.9. A window with a standard deviation under 8
+        grey levels never looks like a design.
 
     Examples
     --------
@@ -155,5 +155,5 @@ def natural_response(grid: PolarGrid, inks: Float32, windows: UInt8, blur: float
     best = np.zeros((len(inks), nature.shape[1]), np.float32)
     for cells in render_cells(grid, attitudes(), 1.0, blur=blur):
         image, own_spread = mean_free_images(weight, cells, inks)
-        np.maximum(best, (-image / own_spread[:, None]) @ nature, out=best)  # minus: ink 1 is dark
+        np.maximum(best, (-image / own_spread[:, None]) @ nature, out=best)  # minus, because ink 1 is dark
     return np.array([(best > limit).sum(1) / len(windows) for limit in LOOKS_ALIKE]).T

@@ -4,12 +4,12 @@ A design is kept if
 
 * its centre is a crossing of straight edges,
 * its smallest region holds a circle of 2 px diameter at a disc radius of 4 px,
-* its basin is at least 0.10; a corner has 0.041,
+* its basin is at least 0.10; the basin of a corner is 0.041,
 * its bound without the rim is at most 0.05 px at 5 px radius,
-* at most one place in 500 of an image looks like it.
+* at most one in 500 places of natural images looks like the design.
 
-Of all sets of four designs, the best set is the set whose closest two designs are farthest apart. If several sets are
-equal, their next closest two designs decide.
+Of all sets of four designs, the best set is the set whose closest two designs are farthest apart. If several sets tie,
+their next closest pairs decide.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SEARCH_STEPS = 6 + IDENTITY_STEPS
 
 
 def best_sets(distance: Float32, size: int, count: int) -> list[tuple[int, ...]]:
-    """Return the sets whose closest two members are farthest apart, best first; the next closest two decide ties.
+    """Return the sets whose closest two members are farthest apart, best first; the next closest pairs decide ties.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def best_sets(distance: Float32, size: int, count: int) -> list[tuple[int, ...]]
     size : int
         Number of members of a set.
     count : int
-        Number of sets. The result has fewer if there are no more.
+        Largest number of sets that are returned.
 
     Returns
     -------
@@ -104,9 +104,10 @@ class SearchResult:
     counts : dict of str to int
         Number of designs that remain after each step of the rule, in order.
     median_bound_px, median_basin, median_pixels_needed : float
-        Medians over all designs of the family whose centre is a crossing. The bound is frontal, at 5 px radius.
+        Medians over all designs of the family whose centre is a crossing. The bound is for a frontal view at 5 px
+        radius.
     sets : tuple of tuples of Patch
-        The best sets, such as the best set and the runner-up.
+        The best sets, best first.
     distances : tuple of ndarray of shape (6,)
         Distances of the pairs within each set, closest first.
 
@@ -156,9 +157,9 @@ def search_designs(
     known : tuple of Patch
         Designs that keep their names and ids in the result. Other designs are named by their code.
     count : int
-        Number of sets.
+        Largest number of sets that are returned.
     progress : callable
-        Called with the number of steps since the call before, :data:`SEARCH_STEPS` in all.
+        Called with the number of steps finished since the last call, :data:`SEARCH_STEPS` in all.
 
     Examples
     --------

@@ -1,6 +1,6 @@
-"""Clean image to worse image: the effects, the ladder of their levels, and the user's own files.
+"""Degrade images: the effects, the ladder of their levels, and the user's own files.
 
-The functions know no patch: an effect that aims at patches takes their discs (x, y and radius in px).
+The functions do not know the designs. An effect that aims at patches takes discs: x, y and radius in px.
 """
 
 import lazy_loader

@@ -15,7 +15,7 @@ from kpbench.geometry.outline import arc_vertices
 from kpbench.types import Float, UInt8
 
 BORDER_MODE = cv2.BORDER_REFLECT_101
-"""How every kernel continues the image beyond its border: mirrored about the outermost pixel."""
+"""Every kernel continues the image beyond the image's border, mirrored about the outermost pixel."""
 
 
 def blur(image: UInt8, kernel_px: float) -> UInt8:
@@ -25,7 +25,7 @@ def blur(image: UInt8, kernel_px: float) -> UInt8:
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
     kernel_px : float
-        Side of the square, px; may be even or fractional.
+        Side of the square, px. The side may be even or fractional.
 
     Returns
     -------
@@ -84,7 +84,7 @@ def gaussian_taps(sigma_px: float) -> Float:
 
 
 def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
-    """Blur along a line through each pixel, as a camera that moves during the exposure does.
+    """Blur along a line through each pixel, like a camera that moves during the exposure.
 
     Parameters
     ----------
@@ -106,12 +106,12 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
     array([[ 0, 30, 30, 30,  0]], dtype=uint8)
     """
     kernel = line_kernel(length_px, angle_deg)
-    # on float32, OpenCV takes half the time that it takes on 8 bits
+    # OpenCV filters float32 in half the time of 8 bits
     spread = cv2.filter2D(image.astype(np.float32), -1, kernel, borderType=BORDER_MODE)
     return np.asarray(cv2.add(spread, np.zeros(1), dtype=cv2.CV_8U), np.uint8)
 
 
-@lru_cache(maxsize=2048)  # holds all kernels that the paper's mix can draw; those of the ladder never repeat
+@lru_cache(maxsize=2048)  # holds all kernels of the paper's mix; the ladder's kernels rarely repeat
 def line_kernel(length_px: float, angle_deg: float) -> Float:
     """Rasterise a line, one pixel wide, through the kernel's centre, by exact area coverage; the sum is 1."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
@@ -122,14 +122,14 @@ def line_kernel(length_px: float, angle_deg: float) -> Float:
     reach = int(np.ceil(half_length + 1)) + 1
     box = (-reach, -reach, 2 * reach + 1, 2 * reach + 1)
     kernel = rasterise([[corners @ np.array([[c, s], [-s, c]])]], [box])[0]
-    kernel = kernel + kernel[::-1, ::-1]  # point-symmetric to the last bit
-    kernel[kernel < 1e-9] = 0.0  # rounding of the running sum; OpenCV is quicker where a weight is 0
+    kernel = kernel + kernel[::-1, ::-1]  # makes the kernel point-symmetric to the last bit
+    kernel[kernel < 1e-9] = 0.0  # removes rounding errors; OpenCV is quicker where a weight is 0
     border = int((kernel.any(axis=0) | kernel.any(axis=1)).argmax())
     return np.asarray(kernel[border : len(kernel) - border, border : len(kernel) - border] / kernel.sum())
 
 
 def defocus(image: UInt8, radius_px: float) -> UInt8:
-    """Blur as a lens out of focus does: each point spreads over a disc, the circle of confusion.
+    """Blur like a lens out of focus: each point spreads over a disc, the circle of confusion.
 
     Parameters
     ----------

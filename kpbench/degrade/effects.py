@@ -1,12 +1,11 @@
 """Effects that degrade images, one pure function per effect; the blurs are in :mod:`kpbench.degrade.blurs`.
 
-Every function takes and returns an image of shape (H, W) or (H, W, 3), uint8, grey or RGB, and leaves its
-argument unchanged. No effect moves the image: the centroid of every kernel is its centre. Kernels continue the
-image beyond its border by mirroring, so that no edge appears there. The unit of intensity is the grey level,
-0 to 255.
+Every function takes and returns an image of shape (H, W) or (H, W, 3), uint8, grey or RGB. The given image stays
+unchanged. No effect moves the image: the centroid of every kernel is its centre. Kernels mirror the image at its
+border, so that no edge appears. The unit of intensity is the grey level, 0 to 255.
 
-An effect is recorded as a dict: its name under "effect", and the arguments of its function. For a level,
-:func:`kpbench.degrade.draw_effect` makes such a record; :func:`kpbench.degrade.apply_effects` carries it out.
+The record of an effect is a dict: the effect's name under "effect", and the arguments of the effect's function.
+:func:`kpbench.degrade.draw_effect` makes the record for a level. :func:`kpbench.degrade.apply_effects` applies records.
 """
 
 from __future__ import annotations
@@ -25,15 +24,15 @@ Effect = dict[str, Any]
 """The record of one effect."""
 
 FLARE_GHOSTS = ((-0.4, 0.25, 0.10), (-0.8, 0.45, 0.06), (0.5, 0.15, 0.12))
-"""Ghosts of a lens flare.
+"""Ghosts of a lens flare, three numbers per ghost.
 
-Position on the line from the image's centre (0) to the lamp (1), radius as a fraction of the glow's reach, and
-intensity as a fraction of the glow's strength.
+Position on the line from the image's centre (0) to the lamp (1). Radius as a fraction of the glow's reach. Intensity as
+a fraction of the glow's strength.
 """
 
 
 def _to_uint8(image: Any) -> UInt8:
-    """Round grey levels and clip them to 0 and 255."""
+    """Round grey levels and clip them to the range 0 to 255."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
 
@@ -70,23 +69,24 @@ def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     >>> round(noise(flat, np.random.default_rng(0), sigma=15).std())
     15
     """
-    # pixels are whole numbers, so the noise may be rounded before it is added;
-    # a uniform 16-bit number then picks one of the quantiles, which is quicker than a normal generator
+    # pixels are whole numbers, so noise can be rounded before the addition: a uniform 16-bit number picks a rounded
+    # quantile, which is quicker than a normal generator
     levels = np.rint(sigma * _normal_quantiles()).astype(np.int16)
     field = levels[np.frombuffer(rng.bytes(2 * image.size), "<u2")].reshape(image.shape)
     return np.asarray(cv2.add(image, field, dtype=cv2.CV_8U), np.uint8)
 
 
 def dimming(image: UInt8, k: float, law: Literal["tenth", "literal"] = "tenth") -> UInt8:
-    """Dim the image by the paper's factor 0.6 to a power.
+    """Multiply all intensities by a power of 0.6, as the paper does.
 
-    The paper prints the factor ``0.6 ** k``, which turns an 8-bit image black at k = 10, where the paper still
-    detects all patches. The default is therefore ``0.6 ** (k / 10)``.
+    The paper prints the factor ``0.6 ** k``. At k = 10, this factor turns an 8-bit image almost black, yet the paper
+    still detects all patches. The default factor is therefore ``0.6 ** (k / 10)``.
 
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
     k : float
+        Exponent, see ``law``.
     law : {"tenth", "literal"}
         "tenth" for ``0.6 ** (k / 10)``, "literal" for the printed ``0.6 ** k``.
 
@@ -137,7 +137,7 @@ def _offsets_from(image: UInt8, x: float, y: float) -> tuple[Any, Any]:
 
 
 def _for_all_channels(field: Any, image: UInt8) -> Any:
-    """Shape a field of shape (H, W) so that it combines with the image, grey or RGB."""
+    """Return a field of shape (H, W) in a shape that broadcasts with the image, grey or RGB."""
     return field if image.ndim == 2 else field[..., None]
 
 
@@ -178,13 +178,13 @@ def shadow_edge(image: UInt8, x: float, y: float, angle_deg: float, light: float
 def rainfall(image: UInt8, seed: int, streaks: int, length_px: float, slant_deg: float) -> UInt8:
     """Draw bright streaks of falling drops over the image.
 
-    The paper's rain is :func:`rain`, whose strength is fixed; the strength of this effect is ``streaks``.
+    The paper's rain is :func:`rain`, whose strength is fixed. The strength of this effect is ``streaks``.
 
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
     seed : int
-        Seed of place, length and opacity of each streak.
+        Seed of place, slant, length, width and opacity of each streak.
     streaks : int
         Number of streaks.
     length_px : float
@@ -252,11 +252,11 @@ def low_light(
     most_gain: float = 16.0,
     bits: int = 10,
 ) -> UInt8:
-    """Take the same picture with less light, then brighten it to its former brightness.
+    """Simulate the image under less light, brightened to its former brightness.
 
-    The camera is linear (EMVA Standard 1288). At full light, grey level 255 is a full well. With
-    ``2 ** -stops`` of the light, electrons arrive by Poisson's law, reading adds Gaussian noise, the analogue
-    gain makes up for the missing light as far as it can, and the converter rounds. A digital factor makes up
+    The camera is linear (EMVA Standard 1288). At full light, grey level 255 is a full well. The simulated exposure has
+    ``2 ** -stops`` of the light. The number of electrons is Poisson-distributed, and reading adds Gaussian noise. An
+    analogue gain up to ``most_gain`` makes up for the missing light. The converter rounds. A digital factor makes up
     for the light that is still missing.
 
     Parameters
@@ -264,7 +264,7 @@ def low_light(
     image : ndarray of shape (H, W) or (H, W, 3), uint8
     rng : numpy.random.Generator
     stops : float
-        Missing light, stops (powers of two).
+        Missing light, stops. One stop halves the light.
     full_well_e : float
         Capacity of a pixel, electrons.
     read_noise_e : float
@@ -336,7 +336,7 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
 
 
 def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
-    """Compute the fraction of each pixel of a box that strips hide, ndarray of shape (height, width)."""
+    """Return the fraction of each pixel of a box that the strips hide, ndarray of shape (height, width)."""
     x, y, w, h = box
     uncovered = np.ones((h, w))
     for polygon in _strip_corners(strips):
@@ -349,7 +349,7 @@ def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
 
 
 def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) -> UInt8:
-    """Add the glow of a lamp in the lens, and three ghosts on the line through the image's centre.
+    """Add the glow of a lamp in the lens, and three ghosts on the line through the lamp and the image's centre.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The ladder of effects: how severe each effect is at each level, and how an effect is drawn and applied."""
+"""The ladder of effects: the levels of each effect, and how an effect is drawn and applied."""
 
 from __future__ import annotations
 
@@ -26,22 +26,23 @@ from kpbench.errors import DataError
 from kpbench.types import Float, UInt8
 
 Discs = Float
-"""The patches that an effect may aim at: ndarray of shape (n, 3), x, y and radius in px."""
+"""The discs of the patches that an effect may aim at: ndarray of shape (n, 3), x, y and radius in px."""
 Draw = Callable[[np.random.Generator, float, tuple[int, int], Discs], Effect]
 """``draw(rng, level, (width_px, height_px), discs)`` returns the record of an effect."""
 
 
 @dataclass(frozen=True)
 class Severity:
-    """How severe an effect of the ladder is at each level.
+    """The levels of an effect of the ladder.
 
     Attributes
     ----------
     levels : tuple of float
-        The rungs of the suites, from mild to severe.
+        The levels that are rungs of the suites, from mild to severe.
     unit : str
+        Unit of the levels.
     bounds : (float, float)
-        Least and most that a level may be.
+        Least and largest level.
     draw : callable
         Draws the parameters that the level leaves open, such as an angle or a place, and returns the record of
         the effect.
@@ -81,7 +82,7 @@ def _draw_motion_blur(rng: np.random.Generator, level: float, size_px: tuple[int
 
 
 def _draw_shadow_edge(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
-    """Draw an edge across one of the patches, up to half a radius off the patch's centre."""
+    """Draw an edge across one of the patches, through a point up to half a radius off the centre in x and in y."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
     x, y = (x, y) + radius * rng.uniform(-0.5, 0.5, 2)
     place = {"x": round(float(x), 2), "y": round(float(y), 2), "angle_deg": _draw_angle_deg(rng, 360)}
@@ -96,11 +97,11 @@ def _draw_rainfall(rng: np.random.Generator, level: float, size_px: tuple[int, i
 
 
 def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
-    """Draw one strip per patch, from a random side, that hides ``level`` percent of the patch's disc."""
+    """Draw one strip per patch that covers ``level`` percent of the patch's disc from a random side."""
     border = np.linspace(1, -1, 2001)
     hidden = (np.arccos(border) - border * np.sqrt(1 - border**2)) / np.pi  # share of a unit disc beyond x = border
     start = float(np.interp(level / 100, hidden, border))
-    end = 1.3  # radii from the patch's centre, beyond its rim
+    end = 1.3  # far end of the strip, radii from the patch's centre: beyond the disc
     strips = []
     for x, y, radius in discs:
         angle_deg, grey = _draw_angle_deg(rng, 360), float(rng.integers(20, 236))
@@ -112,7 +113,7 @@ def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, 
 
 
 def _draw_flare(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
-    """Draw a lamp, one to four radii beside one of the patches."""
+    """Draw a lamp, one to four radii from the centre of one of the patches."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
     angle, distance = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
     place = {"x": round(float(x + distance * np.cos(angle)), 2), "y": round(float(y + distance * np.sin(angle)), 2)}
@@ -148,11 +149,11 @@ def draw_effect(
     effect : str
         A key of :data:`LADDER`.
     level : float
-        Any number in the effect's unit, also between the rungs.
+        Any number within the effect's bounds, in the effect's unit. The number need not be a rung.
     size_px : (int, int)
         Width and height of the image.
     discs : ndarray of shape (n, 3), optional
-        x, y and radius (px) of the patches that shadow edge, occlusion and flare aim at. Without patches, they
+        x, y and radius (px) of the patches that shadow edge, occlusion and flare aim at. Without patches, these effects
         aim at one random place.
 
     Returns
@@ -187,8 +188,8 @@ def draw_effect(
 def draw_paper_mix(rng: np.random.Generator) -> list[Effect]:
     """Draw one to three of the paper's six deteriorations (§2.2), without repetition.
 
-    The paper gives no strengths; these follow the defaults of the library that the paper used. The order is
-    that of light and camera: shadow, rain, motion blur, blur, brightness, noise.
+    The paper gives no strengths. The strengths drawn here follow the defaults of the library that the paper used. The
+    effects are in the order in which light and camera cause them: shadow, rain, motion blur, blur, brightness, noise.
 
     Parameters
     ----------
@@ -252,7 +253,7 @@ def draw_ladder_mix(rng: np.random.Generator, size_px: tuple[int, int], discs: D
     effects = []
     for name in (LADDER_MIX[n] for n in sorted(chosen)):
         severity = LADDER[name]
-        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # a quality is best at its upper bound
+        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # falling levels: high is mild
         level = round(harmless + float(rng.random()) * (severity.levels[-1] - harmless), 0 if name == "jpeg" else 2)
         effects.append(draw_effect(rng, name, level, size_px, discs))
     return effects
@@ -277,7 +278,7 @@ EFFECT_FUNCTIONS: dict[str, Callable[..., UInt8]] = {
 }
 """The function of each effect, by the name in the effect's record."""
 RANDOM_FIELD_EFFECTS = ("noise", "low_light")
-"""Effects that draw a random number per pixel; their records do not hold it."""
+"""Effects that draw random numbers for every pixel. Their records do not hold these numbers."""
 
 
 def apply_effects(image: UInt8, rng: np.random.Generator, effects: Sequence[Effect]) -> UInt8:
@@ -286,9 +287,9 @@ def apply_effects(image: UInt8, rng: np.random.Generator, effects: Sequence[Effe
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
-        Not changed.
+        The array stays unchanged.
     rng : numpy.random.Generator
-        Gives the random fields of ``noise`` and ``low_light``; all else is in the records.
+        Gives the random fields of ``noise`` and ``low_light``. All other parameters are in the records.
     effects : sequence of dict
         Records from :func:`draw_effect`.
 

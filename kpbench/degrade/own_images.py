@@ -17,9 +17,9 @@ from kpbench.types import UInt8
 
 
 def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
-    """Open an image, a folder of images or a video that is to be degraded into a folder ``out``.
+    """Open an image, a folder of images or a video, to be degraded into a folder ``out``.
 
-    Images that an earlier run wrote into ``out`` are left out, where that folder lies below the folder of the images.
+    If ``out`` lies below the folder of the images, the images in ``out`` are left out.
 
     Returns
     -------
@@ -29,7 +29,7 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
     Raises
     ------
     DataError
-        If the source cannot be opened or is a dataset, or if ``out`` holds the images themselves.
+        If the source cannot be opened or is a dataset, or ``out`` is the folder of the images.
 
     Examples
     --------
@@ -49,16 +49,16 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
 def degrade_files(
     source: ImageSource, out: str | Path, steps: Sequence[tuple[str, float]], seed: int = 0
 ) -> Iterator[tuple[Path, list[Effect]]]:
-    """Degrade images one by one and write each as PNG, under its own name and in its own subfolder of ``out``.
+    """Degrade images one by one, and write each as PNG into ``out``, under its name and in its subfolder.
 
-    The n-th image written is a function of the n-th image, the steps, the seed and n.
+    A written image depends only on the image, the image's position in the source, the steps and the seed.
 
     Parameters
     ----------
     source : ImageSource
         From :func:`open_own_images`.
     out : str or Path
-        Folder; made if missing. It must not be the folder of the images.
+        Folder, made if missing. The folder must not be the folder of the images.
     steps : sequence of (str, float)
         Effect and level of :data:`kpbench.degrade.LADDER`, applied in order.
     seed : int
@@ -73,8 +73,8 @@ def degrade_files(
     Raises
     ------
     DataError
-        If an effect is unknown, a level is out of bounds, or a file cannot be written. If images cannot be decoded,
-        after all other images are written.
+        If an effect is unknown, a level is out of bounds, or a file cannot be written. If an image cannot be decoded,
+        the error is raised after all other images are written.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def degrade_files(
 
 
 def _as_grey_if_colourless(image: UInt8) -> UInt8:
-    """Return an RGB image whose channels are equal as a grey image, so that files of grey images stay grey."""
+    """Return an RGB image as grey if its channels are equal, so that the file of a grey image stays grey."""
     if (image == image[..., :1]).all():
         return np.ascontiguousarray(image[..., 0])
     return image

@@ -16,8 +16,8 @@ from kpbench.types import UInt8
 def import_albumentations() -> Any:
     """Import albumentations and return the module.
 
-    The import is slow, and therefore late. The environment variable keeps the library from asking the network for
-    a newer version.
+    The import is slow and is therefore made at the first use. The environment variable keeps the library from asking
+    the network for a newer version.
     """
     os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
     import albumentations
@@ -27,7 +27,7 @@ def import_albumentations() -> Any:
 
 @lru_cache(maxsize=8)
 def _transform(name: str) -> Any:
-    # RandomShadow's default region of interest is the lower half of a road scene; here it is the whole image
+    # by default, RandomShadow shades only the lower half, for road scenes; here it shades the whole image
     options = {"shadow_roi": (0, 0, 1, 1)} if name == "RandomShadow" else {}
     return getattr(import_albumentations(), name)(p=1.0, **options)
 

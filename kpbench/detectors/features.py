@@ -1,7 +1,7 @@
 """OpenCV's ORB and SIFT: points without identities, which show what a general detector finds.
 
-Neither knows what a patch is, so most of their points are false alarms. Settings are OpenCV's defaults; at most 500
-points per image.
+Neither detector knows what a patch is, so most of their points are false alarms. Settings are OpenCV's defaults. Both
+detectors are limited to 500 points per image.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kpbench.images import to_grey
 from kpbench.types import Detections, UInt8
 
 LEAST_IMAGE_PX = 8
-"""OpenCV's pyramids need a few px: an image whose shorter side is smaller has no detections."""
+"""Shorter side of the smallest image that OpenCV's pyramids can take, px. A smaller image has no detections."""
 
 
 def orb(image: UInt8) -> Detections:
@@ -33,7 +33,7 @@ def _by_strength(point: cv2.KeyPoint) -> tuple[float, Sequence[float]]:
 
 
 def _detect_points(detector: cv2.Feature2D, image: UInt8) -> Detections:
-    """Return each place once: OpenCV lists a place with several directions several times."""
+    """Return each place once; OpenCV repeats a place that has several orientations."""
     grey = to_grey(image)
     found = sorted(detector.detect(grey, None) if min(grey.shape) >= LEAST_IMAGE_PX else (), key=_by_strength)
     strongest: dict[tuple[float, float], float] = {}

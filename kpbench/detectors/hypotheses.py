@@ -18,60 +18,60 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""Short semi-axes. Of two hypotheses of one design with centres nearer than this, the likelier one is kept."""
+"""Distance, in short semi-axes. Of two hypotheses of one design with nearer centres, the likelier is kept."""
 
 
 class Evidence(IntEnum):
     """Columns of the evidence that a judge sees.
 
-    The first judge sees the columns up to ``RADIUS``. The second judge, after the fit, sees all columns. Logs are
-    natural. Distances are in short semi-axes.
+    The first judge sees the columns from ``NETWORK_SCORE`` to ``RADIUS``. The second judge, after the fit, sees all
+    columns. Logs are natural. Distances are in short semi-axes.
     """
 
     NETWORK_SCORE = 0
     """Log odds of the network's score."""
     ID_PATCH = 1
-    """Log probability that the ID head sees a patch."""
+    """Log probability, by the ID head, that there is a patch."""
     ID_DESIGN = 2
-    """Log probability of the design by the ID head."""
+    """Log probability of the design, by the ID head."""
     ELLIPSE = 3
     """Log odds that the place lies on a patch, by the ellipse network."""
     NCC = 4
     """-log(1.01 - correlation of the whole design)."""
     SHIFT = 5
-    """Log of the distance from the network's place."""
+    """Log of the distance of the centre from the network's place."""
     CONTRAST = 6
-    """Log of the half contrast over the range of the image."""
+    """Log of half the contrast, divided by the image's range of grey levels."""
     CONTRAST_TO_NOISE = 7
-    """Log of the half contrast over the noise."""
+    """Log of half the contrast, divided by the image's noise."""
     RADIUS = 8
     """Log of the short semi-axis, px."""
     FIT_NCC = 9
     """-log(1.01 - correlation of the fit)."""
     FIT_UNEXPLAINED = 10
-    """Log of the residuals of the fit beyond the noise, in contrasts."""
+    """Log of the part of the fit's residuals that the image's noise does not explain, in contrasts."""
     FIT_BLUR = 11
-    """Blur in short semi-axes."""
+    """Standard deviation of the blur, in short semi-axes."""
     FIT_SHIFT = 12
-    """Log of the distance from the network's place, by the fit."""
+    """Log of the distance of the fitted centre from the network's place."""
     FIT_MOVE = 13
-    """Log of the distance from the pose before the fit."""
+    """Log of the distance of the fitted centre from the centre before the fit."""
     FIT_CONTRAST = 14
-    """Log of the contrast over the range of the image, by the fit."""
+    """Log of the fitted contrast, divided by the image's range of grey levels."""
     FIT_CONTRAST_TO_NOISE = 15
-    """Log of the contrast over the noise, by the fit."""
+    """Log of the fitted contrast, divided by the image's noise."""
     FIT_RADIUS = 16
-    """Log of the short semi-axis, px, by the fit."""
+    """Log of the fitted short semi-axis, px."""
     FIRST_JUDGE = 17
     """Log odds by the first judge."""
     OTHER_PATCHES = 18
-    """Log of 1 + the number of other patches that the image probably has."""
+    """Log of 1 + the expected number of right hypotheses elsewhere in the image."""
     OTHER_ERRORS = 19
-    """Log of 1 + the number of other hypotheses that are probably wrong."""
+    """Log of 1 + the expected number of wrong hypotheses elsewhere in the image."""
     OTHER_BLUR = 20
-    """Log of the blur, px, over the blur of the other patches."""
+    """Log of the ratio of the blur to the mean blur of the other patches."""
     OTHER_CONTRAST = 21
-    """Log of the contrast over the contrast of the other patches."""
+    """Log of the ratio of the contrast to the mean contrast of the other patches."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Hypotheses:
     place : ndarray of shape (n,), int64
         Index of the place among the candidates.
     place_xy : ndarray of shape (n, 2)
-        That place, px.
+        Position of the place, px.
     design : ndarray of shape (n,), int64
         Index of the design.
     xy, A : ndarray of shape (n, 2) and (n, 2, 2)
@@ -91,7 +91,7 @@ class Hypotheses:
     view : ndarray of shape (n, VIEW_PX²)
         From :func:`kpbench.fitting.views.rectify`; nan outside the image.
     blur_px : ndarray of shape (n,)
-        Standard deviation of the blur by the fit, px; 0 before the fit.
+        Standard deviation of the fitted blur, px; 0 before the fit.
     evidence : ndarray of shape (n, columns)
         Columns of :class:`Evidence`.
     """
@@ -113,7 +113,7 @@ class Hypotheses:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Hypotheses]) -> Hypotheses:
-        """Return the hypotheses of all parts, one part after the other."""
+        """Return the hypotheses of all parts, part by part."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
 
@@ -124,7 +124,10 @@ def select_likeliest(place: Int, log_odds: Float) -> Int:
 
 
 def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
-    """Return the indices of hypotheses with at least these log odds, without near repetitions of the same design."""
+    """Return the indices of distinct hypotheses with at least ``least_log_odds``.
+
+    Of near hypotheses of one design, only the likeliest is kept, see :data:`MERGE_DISTANCE`.
+    """
     likely = np.flatnonzero(log_odds >= least_log_odds)
     kept = [np.zeros(0, np.int64)]
     for design in np.unique(hypotheses.design[likely]):
@@ -140,8 +143,8 @@ def judge_inputs(hypotheses: Hypotheses, patches: Sequence[Patch]) -> dict[str, 
     Returns
     -------
     dict
-        ``view`` (n, 2, VIEW_PX, VIEW_PX): the image and the design in the frame of the patch. The design is as
-        blurred as the fit found the image. Both are 0 outside the image. ``evidence`` (n, columns).
+        ``view`` (n, 2, VIEW_PX, VIEW_PX): the image and the design in the frame of the patch. The design is blurred
+        by ``blur_px``. Image and design are 0 at pixels outside the image. ``evidence`` (n, columns).
     """
     design = build_templates(patches).view[hypotheses.design]
     soft = np.flatnonzero(hypotheses.blur_px)

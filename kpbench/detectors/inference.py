@@ -1,4 +1,4 @@
-"""Networks of ONNX files, run by ONNX Runtime or by OpenVINO."""
+"""Run the networks of ONNX files, with ONNX Runtime or with OpenVINO."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     Raises
     ------
     DataError
-        If the runtime that was asked for is not installed.
+        If ``KPBENCH_RUNTIME`` is not one of :data:`RUNTIMES`, or names a runtime that is not installed.
     """
     import onnxruntime
 
@@ -89,7 +89,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     if runtime == "cuda" and not runs_on_gpu():
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if runs_on_gpu():  # the default setting would try out all algorithms for every new size of input
+    if runs_on_gpu():  # the default search would try all algorithms on every new size of image
         providers.insert(0, ("CUDAExecutionProvider", {"cudnn_conv_algo_search": "HEURISTIC"}))
     session = onnxruntime.InferenceSession(model, options, providers=providers)
     metadata = session.get_modelmeta().custom_metadata_map.get("kpbench", "")

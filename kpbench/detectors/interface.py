@@ -1,4 +1,4 @@
-"""What a detector is, the detectors that ship, and how a detector is loaded by name.
+"""The interface of a detector, the detectors that ship, and how to load a detector by name.
 
 A detector takes an image and returns :class:`~kpbench.types.Detections`. It is a function, or an object with a method
 ``detect``. There is nothing to inherit from.
@@ -34,13 +34,13 @@ DETECTORS = {
     "apriltag": "kpbench.detectors.tags:AprilTagDetector",
     "charuco": "kpbench.detectors.tags:CharucoDetector",
 }
-"""Name of each shipped detector → where it is defined, as ``MODULE:ATTR``."""
+"""Name of each shipped detector → its definition, as ``MODULE:ATTR``."""
 PROGRAM_PREFIX = "program:"
-"""A name that begins with this is a command line, see :func:`kpbench.detectors.program.run_program`."""
+"""A name that begins with this prefix is a command line, see :func:`kpbench.detectors.program.run_program`."""
 
 
 class Detector(Protocol):
-    """An object that ``MODULE:ATTR`` may name; a plain function with the signature of ``detect`` will do as well.
+    """An object that ``MODULE:ATTR`` may name. A plain function from an image to detections is a detector too.
 
     Examples
     --------
@@ -73,15 +73,15 @@ class LoadedDetector:
     board : str, optional
         Board of tags that the detector looks for (:data:`kpbench.patches.TAG_BOARDS`); None for patches.
     identity : str, optional
-        SHA-256 of name, version, settings and weights. Kept detections stay valid as long as it is the same. None if
-        the detector tells no version.
+        SHA-256 of name, version, settings and weights. Stored detections stay valid while the identity is unchanged.
+        None if the detector has no version, or was loaded with ``patches``.
     run_many : callable, optional
         Function of a sequence of images, for a detector that is faster on several images than on one.
 
     Raises
     ------
     DataError
-        On a call, if the detector returns anything but finite :class:`Detections`.
+        On a call, if the detector returns no :class:`Detections`, a number that is not finite, or a negative patch ID.
 
     Examples
     --------
@@ -107,7 +107,7 @@ class LoadedDetector:
     detect = __call__
 
     def detect_many(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Return the detections per image; an error does not tell on which image it was raised."""
+        """Return the detections of each image. An error does not name the image that caused the error."""
         if self.run_many is None:
             return [self(image) for image in images]
         return [self._check(found) for found in self.run_many(images)]
@@ -133,15 +133,15 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
         called, or a class that makes such an object when it is called without arguments. Modules in the current folder
         are found.
     threshold : float, optional
-        Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own.
+        Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
-        Designs that ``template`` looks for. None: the shipped four.
+        Designs that ``template`` looks for. None: the four shipped designs.
 
     Raises
     ------
     DataError
-        If there is no such detector, the name stands for something that is no detector, or ``patches`` are given to
-        another detector than ``template``.
+        If there is no such detector, the named object is no detector, or ``patches`` are given to a detector other
+        than ``template``.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def _is_plain(value: object) -> bool:
 
 
 def _set_threshold(detector: Any, threshold: float | None) -> Any:
-    """Return the detector with another threshold, if it has one; the given object stays as it is."""
+    """Return a copy of the detector with this threshold. Without a threshold to set, return the detector itself."""
     if threshold is not None and hasattr(detector, "threshold"):
         detector = copy(detector)
         detector.threshold = threshold

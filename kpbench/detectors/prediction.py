@@ -1,4 +1,4 @@
-"""Run detectors over datasets and over images that have no truth."""
+"""Run detectors over datasets, and over images without truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
 IMAGES_PER_PIECE = 32
-"""Images that a worker process gets at a time."""
+"""Number of images that a worker process gets at a time."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def predict(
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
 ) -> PredictionRun:
-    """Run a detector over a dataset, or over images without truth as by :func:`predict_images`.
+    """Run a detector over a dataset, or over images without truth (see :func:`predict_images`).
 
     Parameters
     ----------
@@ -67,14 +67,15 @@ def predict(
     detector : str or LoadedDetector
         A name as for :func:`kpbench.load_detector`, or a loaded detector.
     threshold : float, optional
-        Detections of a lower score are dropped. A detector given by name gets it in place of its own threshold. None
-        keeps all detections.
+        Detections with a lower score are dropped. A detector given by name gets this threshold in place of its own
+        threshold. None keeps all detections.
     workers : int, optional
-        Processes; None for one per core. A loaded detector, and images without truth, stay in this process.
+        Number of processes; None for one per core. A loaded detector always runs in this process. Images without
+        truth are always processed in this process.
     overlay : Path, optional
         Folder or video file to draw the detections into.
     progress : callable
-        Called with the number of images that are finished since the last call.
+        Called with the number of images finished since the last call.
 
     Returns
     -------
@@ -125,7 +126,8 @@ def predict_images(
     Parameters
     ----------
     source : ImageSource
-        From :func:`kpbench.images.open_images`. A camera has no end: Ctrl-C ends it and keeps what was found.
+        From :func:`kpbench.images.open_images`. Ctrl-C ends a source of unknown length, such as a camera. The
+        detections up to then are kept.
     detector, threshold, overlay, progress
         As for :func:`predict`.
 
@@ -190,7 +192,7 @@ def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
 
 
 def _user_line(error: BaseException) -> str:
-    """Return file and line of the user's code in which an error was raised, or ""."""
+    """Return file and line of the user's code that raised an error, or "" if no user's code did."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
@@ -218,7 +220,7 @@ def detect_images(
     """
     loaded = _load_once(detector, threshold) if isinstance(detector, str) else detector
     if loaded.run_many is not None:
-        with contextlib.suppress(Exception):  # on an error the images are tried one by one, below
+        with contextlib.suppress(Exception):  # after an error, the loop below tries the images one by one
             batch = loaded.detect_many([dataset.image(n) for n in positions])
             progress(len(positions))
             return {n: (_apply_threshold(found, threshold), "") for n, found in zip(positions, batch, strict=True)}

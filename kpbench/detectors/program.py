@@ -18,27 +18,27 @@ from kpbench.types import Detections, UInt8
 def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
     """Run ``COMMAND FOLDER FILE`` over images.
 
-    FOLDER holds the images as 00000000.png, 00000001.png, …; the program writes FILE, a predictions file in JSON. In
-    that file ``image_id`` n means the n-th image, from 0.
+    FOLDER holds the images as 00000000.png, 00000001.png, …. The program writes FILE, a predictions file in JSON. The
+    ``image_id`` in FILE is the number in the image's name.
 
     Parameters
     ----------
     command : str
-        Words as a shell reads them; no shell runs them.
+        Program and arguments, quoted as for a shell. No shell runs the command.
     images : sequence of ndarray
         (H, W) grey or (H, W, 3) RGB, uint8.
 
     Returns
     -------
     list of Detections
-        Per image.
+        One element per image.
 
     Raises
     ------
     DataError
-        If the program cannot be started, ends with an exit code other than 0, or says nothing of an image.
+        If the program cannot be started, ends with an exit code other than 0, writes no FILE, or leaves out an image.
     PredictionsError
-        If the file that it wrote is no predictions file.
+        If FILE is no predictions file.
     """
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         folder, out = Path(scratch) / "images", Path(scratch) / "predictions.json"

@@ -1,4 +1,4 @@
-"""What a detector can run over: a dataset, or images without truth."""
+"""Sources that a detector can run over: datasets, and images without truth."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def open_source(source: str | Path, overlay: Path | None = None) -> Dataset | Im
     source : str or Path
         Path, or ``camera:0`` for the first camera.
     overlay : Path, optional
-        Folder or file that detections will be drawn into. Its images are left out.
+        Folder or file that detections will be drawn into. Images below this folder are left out of the source.
 
     Returns
     -------
@@ -27,7 +27,7 @@ def open_source(source: str | Path, overlay: Path | None = None) -> Dataset | Im
     Raises
     ------
     DataError
-        If the source cannot be opened, or ``overlay`` holds its images.
+        If the source cannot be opened, or ``overlay`` is the folder of the source's images.
 
     Examples
     --------
@@ -43,7 +43,7 @@ def open_source(source: str | Path, overlay: Path | None = None) -> Dataset | Im
 
 
 def has_other_designs(source: Dataset | ImageSource) -> bool:
-    """Return whether a source is a dataset of other designs than those that ship.
+    """Return whether a source is a dataset whose designs differ from the shipped designs.
 
     Examples
     --------

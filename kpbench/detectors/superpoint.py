@@ -1,7 +1,8 @@
 """The reference detector: SuperPoint's two heads from an ONNX file, decoded in NumPy and OpenCV.
 
 The network gives logits for each cell of 8x8 px. :func:`decode` turns the logits into one probability map at full
-resolution. A keypoint is the centre of mass of the probability around a local maximum, across the borders of cells.
+resolution. A keypoint is the centre of mass of the probability in a window around a local maximum. The window may cross
+the borders of cells.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ CELL_PX = 8
 SCHEMA = "kpbench.superpoint/1"
 """Schema of the metadata in the ONNX file."""
 EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
-"""A cell is empty if each of its pixels has lower log odds than this against "no keypoint". Most cells are empty."""
+"""A cell is empty if the log odds of each pixel against "no keypoint" are below this limit. Most cells are empty."""
 
-# Settings of the verified detector. The first three were chosen on synthetic images over training photographs:
-# notebook/training-log.md, "Weaker places, longer ellipses, and judges on their poses" and "Fewer looks, and what ten
-# thousand more images were worth". The source of the last two is not recorded.
+# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images over
+# training photographs: notebook/training-log.md, "Weaker places, longer ellipses, and judges on their poses" and "Fewer
+# looks, and what ten thousand more images were worth". The source of the other two settings is not recorded.
 CANDIDATE_SCORE = 0.015
-"""Least score, by the network, of a place that is verified."""
+"""A place is verified if the network gives at least this score."""
 SCALES = (1.2, 0.5, 0.25)
-"""Scales of the image that the network sees: enlarged for small patches, shrunk for large ones."""
+"""Scales of the image that the network sees: enlarged for small patches, shrunk for large patches."""
 VERIFIED_THRESHOLD = 0.3
 """Least score of a verified detection."""
 MERGE_DISTANCE_PX = 3.0
-"""Of two candidates nearer to each other than this, which different scales may give, the better one is kept."""
+"""Of two candidates nearer to each other than this, the better is kept. Two scales may find one keypoint twice."""
 DISC_SHARE = 0.6
-"""Short semi-axes. Of two detections nearer to each other than this, the likelier one is kept."""
+"""Distance in short semi-axes. Of two detections nearer to each other, the likelier is kept."""
 
 
 @dataclass(frozen=True)
@@ -54,13 +55,13 @@ class Decoding:
     ----------
     threshold : float
         Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
-        With less than 0.01, some keypoints are missed.
+        Below 0.01, some keypoints are missed, as the pixels of empty cells count as 0.
     separation_px : int
-        Of two maxima nearer to each other than this, px, the better one is kept. Two discs with short axes of 10 px
-        that do not overlap have centres further apart.
+        Distance, px. Of two maxima nearer to each other, the better is kept. Two discs that do not overlap have centres
+        further apart if their short axes are at least 10 px long.
     window_px : int
-        Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The sum of the
-        probability in the window is the score, the centre of mass is the place.
+        Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The score is the sum of
+        the probability in the window. The place is the centre of mass.
 
     Examples
     --------
@@ -75,14 +76,14 @@ class Decoding:
 
 
 def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | None = None) -> Detections:
-    """Return the keypoints that the two heads of the network see in one image.
+    """Return the keypoints of one image from the logits of the network's two heads.
 
     Parameters
     ----------
     detector_logits : ndarray of shape (65, h, w), float32
-        One channel per pixel of a cell, row by row, then "no keypoint".
+        One channel per pixel of a cell, row by row, and a last channel for "no keypoint".
     id_logits : ndarray of shape (ids + 1, h, w), float32
-        One channel per design, then "no patch".
+        One channel per design, and a last channel for "no patch".
     decoding : Decoding, optional
         None: the defaults.
 
@@ -165,7 +166,7 @@ def keypoint_probability(detector_logits: Float32) -> Float32:
 
 
 def _interpolate_cells(cells: Float32, xy: Float) -> Float:
-    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; centres of cells are 3.5 + 8i."""
+    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; cell i is centred at 3.5 + 8i."""
     _, h, w = cells.shape
     u = np.clip((xy - (CELL_PX - 1) / 2) / CELL_PX, 0, (w - 1, h - 1))
     low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
@@ -200,19 +201,19 @@ class SuperPointDetector:
         Least score of a detection, in [0, 1]. None: 0.3 if candidates are verified, else 0.5.
     verified : bool
         Whether the candidates of the network are compared with the designs in the file. The verification then gives
-        centre, identity and score. False: the network alone decides, at the image's own scale. It becomes False if a
-        design has no edge at its centre: such a design cannot be verified.
+        centre, identity and score. False: the network alone decides, at the image's own scale. A design without an
+        edge at its centre cannot be verified; ``verified`` becomes False if the file has such a design.
     threads : int
         Threads of the networks; 0 means as many as OpenCV may use.
     scales : tuple of float
         Scales of the image that the network sees, if candidates are verified.
     shipped : str
-        Name of the shipped weights that ``path=None`` means.
+        Name of the shipped weights, for ``path=None``.
 
     Raises
     ------
     DataError
-        If the file cannot be read or was not written by kpbench, or a scale is not in (0, 16].
+        If the file cannot be read or was not written by kpbench, there is no scale, or a scale is not in (0, 16].
 
     Examples
     --------
@@ -267,7 +268,7 @@ class SuperPointDetector:
     detect = __call__
 
     def batch(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Return the detections in each of several images of one size; the network sees all images in one call.
+        """Return the detections in each of several images of one size; the network sees all images of a scale at once.
 
         Raises
         ------
@@ -287,7 +288,7 @@ class SuperPointDetector:
         return self._session.run(None, {"image": blob})
 
     def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
-        """Return the places where the network sees something, for each of several grey images of one size.
+        """Return the candidates of the network, for each of several grey images of one size.
 
         Returns
         -------

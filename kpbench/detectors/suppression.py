@@ -1,4 +1,4 @@
-"""Non-maximum suppression: of points near each other, the best one is kept."""
+"""Non-maximum suppression: of points near each other, the best is kept."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from kpbench.types import Float, Int
 
 
 def suppress(xy: Float, score: Float, distance_px: float | Float) -> Int:
-    """Return the indices of points that have no better kept point near them.
+    """Return the indices of the points that no better point suppresses.
 
-    Points are visited from the best on. A point is kept unless a better point that is kept lies nearer than that
-    point's distance.
+    Points are visited from the best to the worst. A kept point suppresses every worse point within its distance.
+    Suppressed points suppress no other point.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ def suppress(xy: Float, score: Float, distance_px: float | Float) -> Int:
     score : ndarray of shape (n,)
         Higher is better.
     distance_px : float or ndarray of shape (n,)
-        Distance within which a point suppresses worse points, px.
+        Distance within which a kept point suppresses worse points, px.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Detectors of tags, to compare patches with; each is for its own board of :data:`kpbench.patches.TAG_BOARDS`.
+"""Detectors of tags, for comparison with patches: one for each board of :data:`kpbench.patches.TAG_BOARDS`.
 
-Settings are the libraries' defaults, but for those named below. These were chosen in favour of the tags, on scenes of
-another seed than the benchmark's (docs/explanation/fairness-to-tags.md). The detectors do not know the board: every tag
-of the dictionary is reported.
+Settings are the libraries' defaults, except for the settings named below. The exceptions were chosen in favour of the
+tags, on scenes of another seed than the benchmark's (docs/explanation/fairness-to-tags.md). The detectors of ArUco and
+AprilTag do not know the board: they report every tag of their dictionary.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from kpbench.patches.tag_boards import charuco_pattern, tag_dictionary
 from kpbench.types import Detections, UInt8
 
 APRILTAG_DECIMATION = 1.5
-"""Factor by which the AprilTag library shrinks the image; it detects more tags with it than with 1 or 2."""
+"""Factor by which the AprilTag library shrinks the image. The library detects fewer tags with a factor of 1 or 2."""
 LEAST_APRILTAG_SIDE_PX = 8
-"""The AprilTag library ends the process on an image of a few px. No tag is as small as this."""
+"""The AprilTag library crashes on an image of a few px. An image whose shorter side is below this holds no tag."""
 
 
 class ArucoDetector:
     """OpenCV's ArUco detector.
 
-    Corners are refined with lines along the edges, which detects more than OpenCV's other refinements.
+    Corners are refined with lines along the edges. OpenCV's other refinements detect fewer tags.
     """
 
     name = board = "aruco"
@@ -40,13 +40,13 @@ class ArucoDetector:
         corners, ids, _ = self._detector.detectMarkers(to_grey(image))
         if ids is None or not len(ids):
             return Detections.none()
-        # this refinement has (0, 0) on the corner of the top-left pixel, as the AprilTag library that it comes from
+        # this refinement puts (0, 0) on the outer corner of the top-left pixel, as the AprilTag library does
         xy = np.concatenate([quad[0] for quad in corners]).astype(np.float64) - 0.5
         return Detections(xy, np.ones(len(xy)), np.asarray(4 * ids.reshape(-1, 1) + np.arange(4), np.int64))
 
 
 class AprilTagDetector:
-    """The AprilTag library's own detector; it detects more than OpenCV's detector of the same tags.
+    """The AprilTag library's own detector, which detects more tags than OpenCV's detector of the same dictionary.
 
     Raises
     ------
@@ -73,15 +73,15 @@ class AprilTagDetector:
         found = self._detector.detect(grey) if min(grey.shape) >= LEAST_APRILTAG_SIDE_PX else ()
         if not found:
             return Detections.none()
-        # The library has (0, 0) on the corner of the top-left pixel, and its tags are upside down in OpenCV's
-        # dictionary, from which the board is drawn. From OpenCV's top left on, its corners are rb, lb, lt, rt.
+        # The library puts (0, 0) on the outer corner of the top-left pixel. The board is drawn from OpenCV's
+        # dictionary, in which the tags are upside down: OpenCV's order of corners is the library's rb, lb, lt, rt.
         xy = np.concatenate([tag["lb-rb-rt-lt"][[1, 0, 3, 2]] for tag in found]) - 0.5
         score = np.repeat([tag["margin"] for tag in found], 4)
         return Detections(xy, score, np.concatenate([4 * tag["id"] + np.arange(4) for tag in found]))
 
 
 class CharucoDetector:
-    """OpenCV's ChArUco detector; it searches a second time for markers that it missed at first."""
+    """OpenCV's ChArUco detector, set to search a second time for missed markers."""
 
     name = board = "charuco"
     version = f"OpenCV {cv2.__version__}"

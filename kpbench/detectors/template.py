@@ -1,12 +1,13 @@
-"""A classical detector: no training, any design with straight edges that cross at its centre.
+"""A classical detector without training, for any design with straight edges that cross at its centre.
 
-Straight edges that meet at a point point towards it under any perspective. So the first stage, :func:`find_crossings`,
-asks of every pixel whether the gradients around it are perpendicular to the direction to it and do not all have one
-direction. This is a form of the operator of Förstner and Gülch, *A fast operator for detection and precise location of
-distinct points, corners and centres of circular features*, 1987; it needs no templates. A few hundred places remain.
-They are compared with the designs, coarse to fine (:mod:`kpbench.fitting.sector_search`,
-:mod:`kpbench.fitting.align`), each stage on the poses that the stage before kept. The design is fitted to those that
-are left (:mod:`kpbench.fitting.design_fit`).
+1. Crossings (:func:`find_crossings`). Straight edges through a point stay straight under any perspective. The gradients
+   on these edges are perpendicular to the line to the point. A pixel is a crossing if the gradients around the pixel
+   are perpendicular to the line to the pixel, and have more than one direction. This is a form of the operator of
+   Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and centres of
+   circular features*, 1987. The operator needs no templates. A few hundred places remain.
+2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
+   at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
+3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels in the last poses.
 """
 
 from __future__ import annotations
@@ -33,38 +34,42 @@ VERSION = "1"
 
 @dataclass(frozen=True)
 class Thresholds:
-    """All limits of the detector. Their sources are not recorded, but for the weights of the score.
+    """All limits of the detector. The source of their values is not recorded.
 
     Attributes
     ----------
     window_px : float
-        Standard deviation of the window of :func:`find_crossings`, px of a level: it reaches 1 to 3 px.
+        Standard deviation of the window of :func:`find_crossings`, px of a level. Gradients at distances of 1 to 3 px
+        have the most weight.
     radial : float
-        Weight of a gradient along the direction to the place, against one perpendicular to it.
+        Weight of gradients along the line to the place; they count against a crossing.
     octaves : int
-        Levels of the pyramid in which crossings are searched.
+        Number of levels of the pyramid in which crossings are searched.
     px_per_place, places : int
-        Crossings that are kept in a level: one for so many px of it, and so many more.
+        A level of n pixels keeps ``n // px_per_place + places`` crossings.
     margin : float
-        Designs whose correlation is lower than the best one's at a place by more than this are left out.
+        A design is left out at a place if its correlation is more than this below the best design's correlation.
     search_ncc : float
         Least correlation near the centre after the search.
     align_steps, align_ncc : tuple
-        The core is aligned in three rounds: Gauss-Newton steps of each, and least correlation after each.
+        The core is aligned in three rounds. ``align_steps`` are the Gauss-Newton steps per round, ``align_ncc`` the
+        least correlations after the rounds.
     align_radius : float
-        The core is aligned where its short semi-axis measures this many times ``CORE_RADIUS_PX``.
+        The core is aligned in the coarsest level in which its short semi-axis measures at least this many times
+        ``CORE_RADIUS_PX``.
     near : float
-        Two poses are near if their centres are nearer than this, in radii of the core's circle.
+        Two poses are near if the distance of their centres is less than this, in radii of the core's circle.
     much_better_ncc : float
-        Of two near poses of different designs, one is dropped if its correlation is lower by more than this.
+        Of two near poses of different designs, the worse is dropped if its correlation is lower by more than this.
     most_candidates : int
-        Candidates per 640x480 px that are aligned as whole designs; the most of a smaller image, too.
+        Largest number of candidates per 640x480 px that are aligned as whole designs. A smaller image may have as many
+        candidates as an image of 640x480 px.
     whole_steps : int
-        Gauss-Newton steps of that alignment.
+        Number of Gauss-Newton steps in the alignment of whole designs.
     likeness : float
         Least :meth:`ScoreWeights.likeness` of a candidate that is fitted.
     disc_share : float
-        A detection is dropped if it lies within this part of a better one's disc.
+        A detection is dropped if a better detection has its centre nearer than this, in radii of the better disc.
     """
 
     window_px: float = 1.1
@@ -90,20 +95,21 @@ class ScoreWeights:
     """Weights of the score: a logistic regression on five measures of a candidate.
 
     Source: fitted to candidates in synthetic images over training photographs, under every deterioration of the paper.
-    A candidate was right if it lay within a tenth of the radius and had the right design, wrong if it lay on no patch;
-    others were left out.
+    A candidate was right if it lay within a tenth of the radius of a true centre and had the right design. A candidate
+    was wrong if it lay on no patch. All other candidates were left out.
 
     Attributes
     ----------
     offset : float
+        Log odds where all measures are 0.
     core, whole : float
-        Of log(1.01 − correlation), near the centre and over the disc.
+        Weights of log(1.01 − correlation), for the correlations near the centre and over the disc.
     unexplained : float
-        Of the log of the residuals of the fit beyond the image's noise, in contrasts.
+        Weight of the log of the residuals that the image's noise does not explain, in contrasts.
     blur : float
-        Of the blur, in short semi-axes.
+        Weight of the blur, in short semi-axes.
     contrast : float
-        Of the log of the contrast, over the range of the image.
+        Weight of the log of the contrast divided by the image's range of grey levels.
     """
 
     offset: float = -12.55
@@ -132,7 +138,7 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     Returns
     -------
     xy : ndarray of shape (n, 2)
-        Whole px; the strongest places. Their number grows with the level, see :data:`TEMPLATE_THRESHOLDS`.
+        The strongest places, whole px. Their number grows with the size of the level, see :class:`Thresholds`.
     strength : ndarray of shape (n,)
         In falling order.
     """
@@ -151,8 +157,8 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     radial = xx_x + 2 * xy_xy + yy_y  # sum of w (g·q)²
     a, c = xx_x + moment(xx, 0, 2), yy_y + moment(yy, 2, 0)
     b = moment(xy, 2, 0) + moment(xy, 0, 2)
-    # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt it falls as the area does; the smaller
-    # eigenvalue, which measures like Harris' use, falls faster
+    # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt the root falls as the area does; the smaller
+    # eigenvalue, which is a usual measure of corners, falls faster
     spread = np.sqrt(np.maximum(a * c - b * b, 0))
     strength = (spread - TEMPLATE_THRESHOLDS.radial * radial) / np.sqrt(a + c + 50.0)
     strength[[0, -1]], strength[:, [0, -1]] = 0, 0
@@ -266,7 +272,7 @@ class TemplateDetector:
     detect = __call__
 
     def candidates(self, grey: UInt8) -> Candidates:
-        """Return the fits of all places in a grey image that are enough like a design."""
+        """Return the fits of all places in a grey image that look enough like a design."""
         templates, pyramids = build_templates(self.patches), Pyramids(grey)
         raw, smooth = pyramids.raw, pyramids.smooth
         poses = search_sectors(smooth, *_find_places(raw[0], smooth), templates, TEMPLATE_THRESHOLDS.margin)
@@ -279,7 +285,7 @@ class TemplateDetector:
         core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
         row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
         whole = align_poses(smooth, rotated, templates.whole, TEMPLATE_THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
-        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # the best rotation of each
+        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # best rotation of each
         alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
@@ -287,7 +293,7 @@ class TemplateDetector:
 
 
 def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
-    """Return crossings of several octaves: (n, 2) px of the image, and the octave (n,) of each."""
+    """Return crossings of several octaves: places (n, 2), px of the image, and octaves (n,)."""
     levels = [np.asarray(cv2.GaussianBlur(image, (0, 0), 0.5), np.float32), *smooth[1 : TEMPLATE_THRESHOLDS.octaves]]
     xy = [find_crossings(level)[0] for level in levels]
     octave = np.repeat(np.arange(len(xy)), [len(points) for points in xy])
@@ -295,7 +301,10 @@ def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
 
 
 def _select_distinct(poses: Poses) -> Int:
-    """Return indices of poses, best first; near a better pose only a nearly as good pose of another design is kept."""
+    """Return indices of poses, best first.
+
+    A pose near a better pose is kept only if it has another design and a correlation that is nearly as high.
+    """
     n = len(poses)
     offset = poses.xy[:, None] - poses.xy
     near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < TEMPLATE_THRESHOLDS.near
@@ -309,7 +318,7 @@ def _select_distinct(poses: Poses) -> Int:
 
 
 def _select_uncovered(xy: Float, A: Float) -> Int:
-    """Return indices of points, best first, that do not lie in the disc of a better point."""
+    """Return indices of points, best first, without the points that lie in the disc of a better kept point."""
     offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
     inside = np.linalg.norm(offset, axis=2) < TEMPLATE_THRESHOLDS.disc_share
     kept = np.zeros(len(xy), bool)

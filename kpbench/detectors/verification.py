@@ -1,4 +1,4 @@
-"""Verification of a network's candidates by the pixels: is there a patch, of which design, and where is its centre?
+"""Verification of a network's candidates on the pixels: is there a patch, of which design, and where is its centre?
 
 A candidate is a place with a score and with probabilities of the designs. The verification works in five steps.
 
@@ -11,8 +11,8 @@ A candidate is a place with a score and with probabilities of the designs. The v
    corrects the pose. Likely hypotheses are shown to the judge once more, in the corrected pose (:func:`look_again`).
 4. Fit (:func:`fit_hypotheses`). The design is fitted to the pixels (:func:`kpbench.fitting.fit`).
 5. Second judge (:func:`judge`). A small network sees the fitted hypothesis. Its evidence also compares the hypothesis
-   with the other patches of the image, as the patches of an image have similar blur and contrast. Its log odds are the
-   result.
+   with the other patches of the image, as the patches of an image have similar blur and contrast. The log odds of the
+   second judge are the result.
 
 :mod:`kpbench.training.verifier` trains the three networks on synthetic images.
 """
@@ -47,7 +47,7 @@ from kpbench.types import Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
 VERIFIER = "7"
-"""Version of the method. Raise it by one when detections change for any reason but new weights."""
+"""Version of the method. Raise the version by one when detections change for any reason other than new weights."""
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped networks."""
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
@@ -57,27 +57,27 @@ ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 # of them in "Specks, sizes, and how many places an image has" and in "Fewer looks, and what ten thousand more images
 # were worth".
 ID_MARGIN = 3.0
-"""A design is tried if its log probability by the ID head is at most this below that of the likeliest design."""
+"""A design is tried if the ID head gives a log probability at most this far below the likeliest design's."""
 ALL_DESIGNS_LOG_ODDS = 0.0
-"""Log odds of an ellipse from which all designs are tried, whatever the ID head says."""
+"""With at least these log odds of the ellipse, all designs are tried, whatever the ID head says."""
 THOROUGH_LOG_ODDS = -4.8
-"""Log odds of an ellipse from which other sizes of the ellipse and a second rotation are tried."""
+"""With at least these log odds of the ellipse, other sizes of the ellipse and a second rotation are tried."""
 LEAST_ELLIPSE_LOG_ODDS = -6.5
-"""Log odds of an ellipse below which its place is dropped."""
+"""With lower log odds of the ellipse, the place is dropped."""
 SECOND_LOOK_LOG_ODDS = -5.0
-"""Log odds at the first look below which a hypothesis is dropped."""
+"""With lower log odds at the first look, a hypothesis is dropped."""
 LEAST_FIT_LOG_ODDS = -3.5
-"""Log odds at the second look below which a hypothesis is not fitted."""
+"""With lower log odds at the second look, a hypothesis is not fitted."""
 LARGEST_FIT_MOVE = 0.1
-"""Short semi-axes. If the fit moves a centre further, the pose before the fit is kept, as it is right more often."""
+"""Short semi-axes. After a larger move of the centre, the pose before the fit is kept, which is right more often."""
 USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. The judges' log odds hold for such images."""
+"""Number of candidates in a typical training image of 640x480 px. The judges' log odds hold for such an image."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
 """Least half contrast of a hypothesis, and least contrast of a fit in the evidence, grey levels."""
 PLACES_PER_BLOCK = 2**11
-"""Number of places that the ellipse network sees in one call; it bounds the memory."""
+"""Number of places that the ellipse network sees in one call. This limit bounds the memory."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # an image with more candidates than usual does not have more patches, so each candidate is less likely a patch
+    # more candidates than usual do not mean more patches, so each candidate is then less likely a patch
     log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
@@ -171,7 +171,7 @@ def verify_candidates(
 
 
 def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
-    """Find the ellipse that a patch at each place fills.
+    """Find the ellipse that a patch at each place would fill.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def propose_poses(
 ) -> Hypotheses:
     """Return hypotheses of the likely designs at every place that may be a patch.
 
-    Parameters are those of :func:`verify_candidates`.
+    The parameters are described at :func:`verify_candidates`.
     """
     templates = build_templates(patches)
     centre, A, log_odds = find_ellipses(pyramids, xy, threads)
@@ -265,7 +265,7 @@ def _measure(
 ) -> Hypotheses:
     """Return the hypotheses of some poses with their views and evidence; hypotheses of low contrast are left out.
 
-    ``of_networks`` : (n, 4) evidence of the networks, the columns before ``Evidence.NCC``.
+    ``of_networks`` (n, 4) is the evidence of the networks: the columns before ``Evidence.NCC``.
     """
     view, half_contrast = rectify(pyramids.smooth, poses.xy, poses.A, poses.design, templates)
     minor = clipped_semi_axis(poses.A)
@@ -283,8 +283,8 @@ def _measure(
 def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patches: Sequence[Patch]) -> Hypotheses:
     """Return hypotheses in the poses that fit the pixels best, with the evidence of the fit.
 
-    A hypothesis whose fit moved further than ``LARGEST_FIT_MOVE`` keeps its pose. ``log_odds`` : (n,) by the first
-    judge.
+    A hypothesis keeps its pose if the fit moved the centre further than ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) are
+    the first judge's.
     """
     fits = fit(pyramids.raw, before.xy, before.A, [patches[n] for n in before.design])
     contrast, minor = np.maximum(fits.white - fits.black, LEAST_CONTRAST), clipped_semi_axis(fits.A)
@@ -323,9 +323,10 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
     Returns
     -------
     ndarray of shape (n, 2 + k)
-        Log of 1 + the number of other hypotheses that are probably right. Log of 1 + the number that are probably
-        wrong. Difference of each column of ``shared`` from its mean over the hypotheses that are probably right; the
-        difference tends to 0 if there are hardly any.
+        Column 0: log of 1 + the expected number of right hypotheses elsewhere. Column 1: log of 1 + the expected number
+        of wrong hypotheses elsewhere. Other columns: difference of each column of ``shared`` from its mean over the
+        hypotheses elsewhere, weighted by their probabilities. The difference tends to 0 as the expected number of right
+        hypotheses tends to 0.
     """
     right = 1 / (1 + np.exp(-log_odds))
     elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]
@@ -343,7 +344,7 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
     log_odds : ndarray of shape (n,)
         Log odds that there is a patch of this design and that the centre is right.
     corrected : Hypotheses
-        The same hypotheses in the poses that the judge takes for right.
+        The same hypotheses, with the poses that the judge corrected.
     """
     if not len(hypotheses):
         return np.zeros(0), hypotheses
@@ -353,7 +354,7 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
 
 
 def verifier_version(*candidate_settings: object) -> str:
-    """Return :data:`VERIFIER` and the first digits of a SHA-256 of the weights and of the candidates' settings."""
+    """Return :data:`VERIFIER` with the first 8 digits of a SHA-256 of the weights and the candidates' settings."""
     weights = [(WEIGHTS / f"{name}.onnx").read_bytes() for name in (ELLIPSE, FIRST_JUDGE, SECOND_JUDGE)]
     digest = hashlib.sha256(b"".join([*weights, repr(candidate_settings).encode()])).hexdigest()
     return f"v{VERIFIER}-{digest[:8]}"
@@ -369,7 +370,7 @@ def _open(network: str, threads: int) -> InferenceSession:
 
 
 def _contrast_evidence(contrast: Float, pyramids: Pyramids) -> list[Float]:
-    """Return the logs of contrasts (n,), grey levels, over the range of the image and over its noise."""
+    """Return the logs of contrasts (n,), grey levels, divided by the image's range of grey levels and by its noise."""
     return [np.log(contrast / (pyramids.grey_range + 5)), np.log(contrast / (pyramids.noise + 1))]
 
 

@@ -25,13 +25,13 @@ from kpbench.fitting.templates import DesignTemplates, Templates
 from kpbench.types import Float, Float32, Int
 
 AMBIGUOUS_NCC = 0.15
-"""A second rotation is kept if its correlation with the image is at most this below that of the best rotation."""
+"""A second rotation is kept if its correlation with the image is at most this far below the best rotation's."""
 DISTINCT_NCC = 0.5
 """Two rotations of a design are distinct if their templates correlate by less than this."""
 RADIUS_FACTORS = (0.8, 0.9, 1.1)
-"""Factors of the size of an ellipse that are tried: rings or the ground around a patch may mislead its size."""
+"""Sizes of an ellipse that are tried besides the given size: a patch's rings or ground may have biased that size."""
 WHOLE_RADIUS_PX = 5.6
-"""The whole design is compared in the coarsest level in which its short semi-axis still measures so many px."""
+"""The whole design is compared in the coarsest level in which its short semi-axis measures at least this, px."""
 LARGEST_STEP = 0.35
 """Largest change of a parameter in one Gauss-Newton step; a longer step is shortened."""
 
@@ -65,10 +65,10 @@ class Poses:
 
 
 def short_semi_axis(A: Float) -> Float:
-    """Return the short semi-axes (N,) of the ellipses that maps (N, 2, 2) make of the unit circle.
+    """Return the short semi-axes (N,) of the ellipses to which maps (N, 2, 2) take the unit circle.
 
-    A short semi-axis is the smaller singular value, from the trace s of AᵀA and the determinant d of A:
-    √((s − √(s² − 4d²)) / 2).
+    The short semi-axis is the smaller singular value of A: √((s − √(s² − 4d²)) / 2), with the trace s of AᵀA and the
+    determinant d of A.
     """
     a, b, c, d = A.reshape(-1, 4).T
     square, det = a * a + b * b + c * c + d * d, a * d - b * c
@@ -83,7 +83,7 @@ def rotate_within_ellipse(
     templates: DesignTemplates,
     thorough: NDArray[np.bool_] | None = None,
 ) -> tuple[Int, Poses]:
-    """Find the rotation of a design within an ellipse, and a second rotation where it is as likely.
+    """Find the rotation of a design within an ellipse, and a second rotation if it is nearly as likely.
 
     Parameters
     ----------
@@ -95,12 +95,12 @@ def rotate_within_ellipse(
         Index of the design that is rotated.
     templates : DesignTemplates
     thorough : ndarray of shape (N,), bool, optional
-        Ellipses for which other sizes and a second rotation are tried. None: all.
+        Whether other sizes of an ellipse and a second rotation are tried. None: for all ellipses.
 
     Returns
     -------
     row : ndarray of shape (M,), int64
-        Index of the ellipse of each pose, in order; each ellipse occurs once or twice.
+        Index of each pose's ellipse, ascending. Each ellipse occurs once or twice.
     poses : Poses
         M poses.
     """
@@ -152,7 +152,7 @@ def rotate_poses(xy: Float, A: Float, design: Int, rotation: Int, ncc: Float32, 
 
 
 def _correlate_inside(values: Float32, inside: NDArray[np.bool_], inks: Float32) -> Float32:
-    """Return the correlations (N, R) of grey values (N, M) with inks (R, M), over the samples of each row inside."""
+    """Return the correlations (N, R) of grey values (N, M) with inks (R, M), over the samples inside the image."""
     count = np.maximum(inside.sum(axis=1, keepdims=True), 1)
     grey = np.where(inside, values - (values * inside).sum(axis=1, keepdims=True) / count, 0)
     mask = inside.astype(np.float32)
@@ -173,14 +173,14 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
     templates : Templates
         ``DesignTemplates.core`` or ``DesignTemplates.whole``.
     steps : int
-        0 only measures the correlation.
+        Number of steps. With 0 steps, only the correlation is measured.
     radius_px : float
-        Poses are compared in the coarsest level in which their short semi-axis still measures so many px.
+        Poses are compared in the coarsest level in which their short semi-axis measures at least this.
 
     Returns
     -------
     Poses
-        With the correlation after the last step.
+        The moved poses, with the correlations after the last step.
     """
     xy, A, design = poses.xy, poses.A, poses.design
     ink, solve, has_size = templates.ink[design], templates.solve[design], templates.has_size[design]
@@ -192,7 +192,7 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
         delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
         delta *= np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
         stepped = A @ np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
-        # sectors look the same at every size: the step of the size only fits the blur, so the size is kept
+        # sectors look the same at every size, so a step in size would only fit the blur: their size is kept
         kept_size = short_semi_axis(A) / np.maximum(short_semi_axis(stepped), 1e-9)
         A = stepped * np.where(has_size, 1.0, kept_size)[:, None, None]
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])
@@ -202,7 +202,8 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
 def _compare(values: Float32, ink: Float32, cut: Int, outside: NDArray[np.bool_]) -> tuple[Float32, Float32]:
     """Return the correlations (N,) of grey values with templates, and the residuals (N, M) in units of the templates.
 
-    Samples outside the image (of the rows ``cut``) do not count in the correlation; their residual is 0.
+    The rows ``cut`` have samples outside the image. These samples do not count in the correlation, and their residual
+    is 0.
     """
     scaled = normalise_rows(values)
     ncc = np.einsum("nm,nm->n", scaled, ink)
@@ -217,7 +218,7 @@ def _compare(values: Float32, ink: Float32, cut: Int, outside: NDArray[np.bool_]
         size, spread = (np.einsum("nm,nm->n", part, part) + 1e-6 for part in (model, grey))
         slope = np.einsum("nm,nm->n", grey, model) / size
         spread += LEAST_DEVIATION**2 * count[:, 0]
-        # a pattern of which less than half lies in the image proves little
+        # a pattern with less than half its samples in the image proves little
         ncc[cut] = slope * np.sqrt(size / spread) * np.minimum(1, 2 * count[:, 0] / inside.shape[1])
         residual[cut] = np.where(inside, grey / np.maximum(slope, 0.3 * np.sqrt(spread))[:, None] - model, 0)
     return ncc, residual

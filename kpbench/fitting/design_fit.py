@@ -1,4 +1,4 @@
-"""The design fit: centre, pose, inks and blur of a patch, solved for on the pixels.
+"""The design fit: centre, pose, inks and blur of a patch, estimated from the pixels.
 
 :func:`fit` renders the design with exact coverage, blurs it, and changes its unknowns until the rendering and the
 pixels agree (Gauss-Newton with robust weights). The unknowns are the centre, the affine map, the perspective, both
@@ -24,15 +24,15 @@ COARSE_PX, COARSE_STEPS = 30.0, 2
 FINE_PX, FINE_STEPS = 100.0, 3
 """The last ``FINE_STEPS`` steps use the finest level with a long semi-axis of at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
-"""Short semi-axes. After a step that moved a patch by less, no further step is taken in the same level."""
+"""Short semi-axes. After a step that moved a patch by at most this, no further step is taken in the same level."""
 LEVEL_BLUR_PX = 0.6
-"""Standard deviation of the blur that one level of the pyramid adds, in its own px."""
+"""Standard deviation of the blur that the pyramid adds to a coarser level than the image, in px of the level."""
 MODEL_REACH = 1.3
-"""The rendered design reaches beyond the disc by this factor, so that blur brings no outer edge into the disc."""
+"""The outermost ring is rendered to this many times its radius, so that no blurred outer edge reaches the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
-"""Prior of the perspective: standard deviation of the relative change of distance over the patch, per px of radius."""
+"""Prior of the perspective: standard deviation of ``bend``, per px of the short semi-axis."""
 LEAST_PIXELS = 12
-"""Least number of pixels inside the disc, and least number of pixels on edges, for a step."""
+"""A step needs at least this many pixels inside the patch, and at least this many pixels on edges."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Fit:
     black, white : ndarray of shape (N,)
         Inks, grey levels.
     blur_px : ndarray of shape (N,)
-        Standard deviation of a Gaussian, px.
+        Standard deviation of the Gaussian blur, px.
     ncc : ndarray of shape (N,)
         Correlation of model and pixels over the disc, in [-1, 1].
     noise : ndarray of shape (N,)
@@ -81,11 +81,11 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
     Parameters
     ----------
     levels : list of ndarray
-        ``kpbench.fitting.build_pyramid(image, 0)``. The first steps are taken where the patch's long semi-axis
-        measures 15 to 30 px, the last steps where it measures 50 to 100 px; a smaller patch is fitted in the image
-        itself.
+        ``kpbench.fitting.build_pyramid(image, 0)``. The first steps are taken in the level in which the patch's long
+        semi-axis measures 15 to 30 px, the last steps in the level in which it measures 50 to 100 px. For a smaller
+        patch, the steps are taken in the image itself.
     xy, A : ndarray of shape (N, 2) and (N, 2, 2)
-        Poses to start from, px; right to about a tenth of the radius.
+        Poses to start from, px. They must be right to about a tenth of the radius.
     patches : sequence of Patch
         N designs.
 
@@ -127,10 +127,11 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
 
 @dataclass(frozen=True)
 class _State:
-    """One patch while it is fitted, in px of its level.
+    """One patch during the fit, in px of its level.
 
-    Pixels x with ``|window⁻¹ (x − xy)| < 1`` count. ``bend`` is the last row of the homography. ``moved`` is how far
-    the last step moved the patch, in short semi-axes.
+    ``window`` is the map that the fit started from. With this map about ``xy``, the pixels inside the patch's extent
+    count, except for a margin at the rim. ``bend`` holds the first two entries of the last row of the homography.
+    ``moved`` is the size of the last step, in short semi-axes.
     """
 
     xy: Float
@@ -178,7 +179,8 @@ def _black_polygons(state: _State, patch: Patch) -> list[Float]:
 def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
     """Return the black cells of a design as polygons in the patch frame.
 
-    Coverage adds up, so cells that touch leave no seam. ``tolerance`` is the largest distance of arc and polygon.
+    Coverages of cells are added, so cells that touch leave no seam. ``tolerance`` is the largest distance between arc
+    and polygon, in disc radii.
     """
     radii, angles, black = patch.cells
     radii = np.append(radii[:-1], radii[-1] * MODEL_REACH)
@@ -222,7 +224,7 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
         return state
     gx, gy = (cv2.Sobel(ink, cv2.CV_32F, *axis, ksize=1, scale=0.5) for axis in ((1, 0), (0, 1)))
     gx, gy, laplace = gx[inside], gy[inside], cv2.Laplacian(ink, cv2.CV_32F)[inside]
-    edge = np.flatnonzero(gx * gx + gy * gy > 1e-4)  # only pixels on edges tell where the patch is
+    edge = np.flatnonzero(gx * gx + gy * gy > 1e-4)  # only pixels on edges depend on the pose
     if len(edge) < LEAST_PIXELS:
         return state
     at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
@@ -239,7 +241,7 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
 
 
 def _inverse(m: Float) -> tuple[float, float, float, float]:
-    """Return the inverse of a 2x2 matrix, row by row; many times faster than NumPy's general inverse."""
+    """Return the inverse of a 2x2 matrix, row by row, many times faster than NumPy's general inverse."""
     (a, b), (c, d) = m.tolist()
     det = a * d - b * c or 1e-12
     return d / det, -b / det, -c / det, a / det
@@ -248,9 +250,10 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
 def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float) -> _State:
     """Solve the normal equations and take the step, within limits.
 
-    The unknowns are white, ink, x, y, four entries of A, two of the bend, and the square of the blur.
+    The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, and the square of the
+    blur.
     """
-    damped = np.arange(4, 11)  # sectors alone leave the size and some stretches undetermined
+    damped = np.arange(4, 11)  # a design of sectors alone does not determine its size and some stretches
     normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
     normal[[0, 1, 2, 3], [0, 1, 2, 3]] += 1e-3
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2

@@ -1,4 +1,4 @@
-"""Image pyramids, and grey values of an image at many places at once."""
+"""Image pyramids, and how to sample them at many places at once."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from kpbench.types import Float, Float32, Int, UInt8
 
 MOST_LEVELS, LEAST_SIDE_PX = 7, 16
-"""Largest number of levels, and shorter side of a level that is halved once more, px."""
+"""Largest number of levels, and shorter side of the smallest level that is halved once more, px."""
 REMAP_ROWS = 2**14
-"""Number of poses that are sampled in one call: OpenCV's remap takes fewer than 2**15 rows."""
+"""Largest number of poses that are sampled in one call, as OpenCV's remap takes fewer than 2**15 rows."""
 LEAST_DEVIATION = 1.0
-"""Grey levels. Added in quadrature to standard deviations, so that correlations with an even surface are near 0."""
+"""Grey levels. Added in quadrature to standard deviations, so that an even surface has correlations near 0."""
 
 
 def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
@@ -25,8 +25,8 @@ def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
     ----------
     image : ndarray of shape (H, W), uint8
     smooth_px : float
-        Standard deviation of the Gaussian that smooths level 0, px. 0 leaves level 0 as it is. Every other level is
-        smoothed by about 0.7 of its own px.
+        Standard deviation of the Gaussian that smooths level 0, px. 0 leaves level 0 unchanged. Every other level is
+        smoothed by 0.5 to 0.6 px of that level.
 
     Returns
     -------
@@ -56,8 +56,8 @@ class Pyramids:
     raw, smooth : list of ndarray, float32
         :func:`build_pyramid` of the image, without and with smoothing of level 0.
     noise : float
-        Standard deviation of the image's noise, grey levels. It is estimated from the median of second differences,
-        which edges hardly move.
+        Standard deviation of the image's noise, grey levels. The estimate is based on the median of second differences,
+        which edges hardly change.
     grey_range : float
         Difference between the bright and the dark parts of the image (98th and 2nd percentile), grey levels.
     """
@@ -65,7 +65,7 @@ class Pyramids:
     def __init__(self, grey: UInt8) -> None:
         self.raw, self.smooth = build_pyramid(grey, 0), build_pyramid(grey)
         kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # the median of integers takes less time
+        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # integers, because their median takes less time
         self.noise = 1.4826 / 6 * float(np.median(np.abs(differences)))
         dark, bright = np.percentile(grey[::4, ::4], (2, 98))
         self.grey_range = float(bright - dark)
@@ -88,7 +88,7 @@ def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, p
     Returns
     -------
     ndarray of shape (N, M), float32
-        Outside the image the border is repeated.
+        A sample outside the image has the value at the border.
     """
     values = np.empty((len(xy), len(points)), np.float32)
     fan = points.T.astype(np.float32)
@@ -102,7 +102,7 @@ def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, p
 
 
 def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Int, NDArray[np.bool_]]:
-    """Return the poses that have samples outside the image, and which samples these are.
+    """Return the poses that may have samples outside the image, and mark these samples.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> 
     Returns
     -------
     rows : ndarray of shape (K,), int64
-        Indices of poses.
+        Indices of the poses. A few may have all samples inside.
     outside : ndarray of shape (K, M), bool
     """
     last = np.array(image.shape[::-1]) - 1.0
@@ -124,13 +124,13 @@ def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> 
 
 
 def normalise_rows(values: Float32) -> Float32:
-    """Return rows (N, M) of grey values with zero mean and unit norm; even surfaces come out near 0."""
+    """Return rows (N, M) of grey values with zero mean and unit norm; the row of an even surface is near 0."""
     centred = values - values.mean(axis=1, keepdims=True)
     size = np.einsum("nm,nm->n", centred, centred) + np.float32(LEAST_DEVIATION**2 * values.shape[1])
     return np.asarray(centred / np.sqrt(size)[:, None])
 
 
 def choose_level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Int:
-    """Return the coarsest level (N,) in which a radius (N,) of the image still measures ``least_px`` px."""
+    """Return the coarsest levels (N,) in which radii (N,), px of the image, measure at least ``least_px`` px."""
     octave = np.floor(np.log2(np.maximum(radius_px, 1e-6) / least_px))
     return np.clip(octave, 0, len(levels) - 1).astype(np.int64)

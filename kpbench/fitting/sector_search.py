@@ -1,10 +1,10 @@
 """Poses of designs from a rough place and scale alone.
 
 The search uses the innermost sectors of a design, which look the same at every size. :func:`search_sectors` samples
-circles around each place under many tilts and correlates them with the sectors of each design in each rotation.
+circles around each place under many tilts. The samples are correlated with the sectors of each design in each rotation.
 :func:`kpbench.fitting.align.align_poses` moves the result onto the image. :func:`estimate_size` then measures how far
-the sectors reach, which is the size of the patch, and :func:`core_symmetries` adds the rotations that only the whole
-design tells apart.
+the sectors reach, which gives the size of the patch. :func:`core_symmetries` adds the rotations in which the sectors
+look the same but the whole design does not.
 """
 
 from __future__ import annotations
@@ -29,23 +29,23 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 CORE_RADIUS_PX = 3.0
-"""Short semi-axis of the core's circle, px of the level that is searched. The smallest patches have 5 px."""
+"""Short semi-axis of the core's circle, px of the level that is searched. The smallest patches measure 5 px."""
 SPOKES = 40
 """Samples on each circle of :func:`estimate_size`."""
 RING_RADII = 0.7 * 1.12 ** np.arange(34)
-"""Radii of these circles, in radii of the core's circle."""
+"""Radii of the circles of :func:`estimate_size`, in radii of the core's circle."""
 FIRST_RINGS = 12
-"""Number of circles of the first look; at most places that are no patch it suffices."""
+"""Number of circles that are sampled first. At most places without a patch, no further circles are needed."""
 AGREEING_SHARE = 0.7
 """A circle belongs to the patch if at least this share of its votes is for the predicted ink."""
 VOTING_SHARE = 0.3
 """A circle belongs to the patch if at least this share of its samples votes for the predicted ink."""
 VOTE_OFFSET = 0.4
-"""A sample votes in favour if its agreement, from -1 to 1, is larger than this."""
+"""A sample votes for the predicted ink if its agreement with this ink, from -1 to 1, is larger than this."""
 BLOCK = 2**11
-"""Number of poses that are measured together; it bounds the memory."""
+"""Number of poses that are measured together. This limit bounds the memory."""
 _TILTS = ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9))
-"""Tilts that are searched: ratio of short to long semi-axis, and number of directions."""
+"""Tilts that are searched: ratio of short to long semi-axis, and number of directions of the tilt."""
 
 
 @lru_cache(maxsize=1)
@@ -75,7 +75,7 @@ def search_sectors(
         Pyramid level to search; the core's circle has a short semi-axis of ``CORE_RADIUS_PX · 2^level`` px.
     templates : DesignTemplates
     margin : float
-        Designs whose correlation is lower than the best one's by more than this are left out.
+        A design is left out at a place if its correlation is more than this below the best design's correlation.
 
     Returns
     -------
@@ -102,9 +102,9 @@ def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemp
     """Measure how far the sectors reach, and turn poses of the core into poses of the unit disc.
 
     Circles of growing size are sampled around each place. Each sample votes for or against the ink that the sectors
-    predict. The ellipse with the largest sum of votes is the outer edge of the sectors. A design with two edges looks
-    the same when it is stretched along them, so ellipses of several stretches are tried; a design with three or more
-    edges fixes its stretch.
+    predict. The ellipse with the largest sum of votes is the outer edge of the sectors. Sectors with edges of two
+    directions look the same when they are stretched along these directions, so ellipses of several stretches are tried.
+    Edges of three or more directions determine the stretch.
     """
     A = poses.A.copy()
     for rows in np.split(np.arange(len(poses)), range(BLOCK, len(poses), BLOCK)):
@@ -115,19 +115,19 @@ def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemp
 
 
 def core_symmetries(poses: Poses, templates: DesignTemplates) -> tuple[Int, Poses]:
-    """Return the poses in every rotation in which the core looks the same but the whole design does not.
+    """Return the poses in every rotation in which the core looks the same but the whole design differs.
 
     Returns
     -------
     row : ndarray of shape (M,), int64
-        Index of the given pose of each, in order; each given pose occurs once or more.
+        Index of the given pose that each pose was rotated from, ascending. Each given pose occurs once or more.
     poses : Poses
         M poses.
     """
     core, whole = (
         np.bincount(kind.rotated_design, minlength=len(templates.patches)) for kind in (templates.core, templates.whole)
     )
-    # a design that looks the same n times in a full turn has templates for 1/n of all rotations
+    # a design that looks the same n times in a full turn has distinct templates for 1/n of all rotations
     period = 2 * np.pi * core / CORE_ROTATIONS
     symmetries = np.maximum(np.rint(CORE_ROTATIONS / core / (WHOLE_ROTATIONS / whole)), 1).astype(np.int64)
     row = np.repeat(np.arange(len(poses)), symmetries[poses.design])
@@ -148,7 +148,7 @@ def _fit_edge(
     A : ndarray of shape (N, 2, 2)
         Maps of the unit disc, px.
     complete : ndarray of shape (N,), bool
-        Whether more circles would change nothing.
+        Whether more circles would leave the result unchanged.
     """
     votes = _vote(levels, poses, templates, count)
     summed = votes * (RING_RADII * np.gradient(RING_RADII)).astype(np.float32)[:count, None]
@@ -163,7 +163,7 @@ def _fit_edge(
         total, agreeing, cast = (
             (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), count) for t in tables
         )
-        # beyond the first circle that disagrees, agreement is chance
+        # the patch ends at the first circle that disagrees; circles beyond can agree only by chance
         beyond = np.logical_or.accumulate(
             (agreeing < AGREEING_SHARE * cast) | (agreeing < VOTING_SHARE * SPOKES), axis=2
         )
@@ -176,7 +176,7 @@ def _fit_edge(
 
 
 def _vote(levels: Sequence[Float32], poses: Poses, templates: DesignTemplates, count: int) -> Float32:
-    """Return the votes (N, circles, spokes): from -1.4 (the other ink) to 0.6 (the predicted ink); 0 outside."""
+    """Return votes (N, circles, spokes), from -1.4 (other ink) to 0.6 (predicted ink); 0 outside the image."""
     spokes, radii = _spoke_points(), RING_RADII[:count]
     ink = np.array([look_up_ink(draw_ink(patch, False), spokes) for patch in templates.patches], np.float32)
     predicted = ink[poses.design][:, None]
@@ -210,7 +210,7 @@ def _ellipse_ends(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
     ends : sparse array of shape (G · circles, circles · spokes)
         1 at the samples where the ellipse of a shape and size ends.
     known : int
-        Last circle at which all ellipses end within the circles that were sampled.
+        Index of the last size at which every ellipse lies within the circles that were sampled.
     """
     shapes = _stretches_along_edges(patch)
     reach = 1 / np.linalg.norm(np.einsum("gij,sj->gsi", np.linalg.inv(shapes), _spoke_points()), axis=2)
@@ -229,7 +229,7 @@ def _spoke_points() -> Float:
 
 @lru_cache(maxsize=64)
 def _stretches_along_edges(patch: Patch) -> Float:
-    """Return maps (G, 2, 2) of the patch frame, of determinant 1, that leave the innermost edges where they are."""
+    """Return maps (G, 2, 2) of the patch frame, of determinant 1, that keep the directions of the innermost edges."""
     _, angles, black = patch.cells
     edges = np.unique(np.round(angles[black[0] != np.roll(black[0], 1)] % 180.0, 6))
     if len(edges) > 2:

@@ -1,7 +1,7 @@
 """Designs as templates: their inks at sample points, in every rotation.
 
-Two kinds of templates are compared with an image. The *core* is the innermost sectors of a design; sectors through the
-centre look the same at every size. The *whole* is the design out to its rim.
+Two kinds of templates are compared with an image. The *core* is the innermost sectors of a design, which look the same
+at every size. The *whole* is the design out to its rim.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 CORE_ROTATIONS = 24
-"""Rotations of the core that are tried, and samples on each circle of a template."""
+"""Number of rotations of the core that are tried, and number of samples on each circle of a template."""
 WHOLE_ROTATIONS = 72
-"""Rotations of the whole design that are tried: right to 2.5 degrees, where a fit can start."""
+"""Number of rotations of the whole design that are tried: 5 degrees apart, which is close enough for a fit."""
 CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
 """Radii of the circles that are sampled, in radii of the core's circle and in radii of the disc."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
-"""Standard deviation of a template's blur, in the same units: it matches the smoothing of the image pyramid."""
+"""Standard deviation of a template's blur, in the units of the radii, to match the smoothing of the image pyramid."""
 SAME_NCC = 0.998
-"""Two rotations of a design look the same if their templates correlate by at least this; one of them is kept."""
+"""Two rotations of a design look the same if their templates correlate by at least this. Only the first is kept."""
 VIEW_REACH = 1.7
 """Half the side of a view, in radii of the disc: a view shows the disc and the ground around the disc."""
 VIEW_PX = 32
 """Side of a view, px."""
 _INK_PX = 273
-"""Side of an ink image, px; an ink image shows as much as a view."""
+"""Side of an ink image, px. An ink image covers the same square as a view."""
 _angles_rad = np.arange(CORE_ROTATIONS) * (2 * np.pi / CORE_ROTATIONS)
 _circle = np.column_stack([np.cos(_angles_rad), np.sin(_angles_rad)])
 
@@ -48,15 +48,15 @@ class Templates:
     ink : ndarray of shape (D, M), float32
         Zero mean and unit norm per design.
     solve : ndarray of shape (D, 6, M), float32
-        Maps a difference of templates to a Gauss-Newton step in (x, y, a11, a12, a21, a22).
+        Maps a residual to a Gauss-Newton step in (x, y, a11, a12, a21, a22).
     has_size : ndarray of shape (D,), bool
-        Whether the template changes with its size; sectors do not.
+        Whether the template looks different at another size; sectors look the same.
     rotated : ndarray of shape (R, M), float32
         Inks of all designs in all rotations, without rotations that look like an earlier one.
     rotated_design : ndarray of shape (R,), int64
-        Index of the design of each.
+        Index of the design in each row of ``rotated``.
     rotated_angle : ndarray of shape (R,)
-        Rotation of each, rad.
+        Rotation in each row of ``rotated``, rad.
     """
 
     points: Float
@@ -132,10 +132,10 @@ def _linearise(image: Float32, points: Float) -> tuple[Float, Float]:
     ink = ink - ink.mean()
     jacobian /= np.linalg.norm(ink)
     ink /= np.linalg.norm(ink)
-    jacobian -= jacobian.mean(axis=0)  # grey offset and contrast are free
+    jacobian -= jacobian.mean(axis=0)  # offset and contrast of the grey values are free
     jacobian -= np.outer(ink, ink @ jacobian)
     normal = jacobian.T @ jacobian
-    # sectors look the same when they are stretched along two edges: damping keeps that stretch where it was
+    # sectors with two edges look the same when they are stretched along the edges; damping keeps this stretch unchanged
     return ink, np.linalg.solve(normal + np.eye(6) * 0.02 * np.trace(normal) / 6, jacobian.T)
 
 
@@ -147,13 +147,14 @@ def draw_ink(patch: Patch, whole: bool) -> Float32:
     ----------
     patch : Patch
     whole : bool
-        True draws the design; its rim is continued outwards. False draws its innermost sectors, continued outwards.
+        True draws the design, with its outermost ring continued outwards. False draws its innermost sectors, continued
+        outwards.
     """
     fine = 3
     ticks = ((np.arange(_INK_PX * fine) + 0.5) / (_INK_PX * fine) * 2 - 1) * VIEW_REACH
     points = np.stack(np.meshgrid(ticks, ticks), axis=-1)
-    # of the whole design, points beyond the rim take the ink at radius 0.999; of the core, all points take the ink of
-    # the innermost sectors
+    # whole design: points beyond the disc take the ink at radius 0.999; core: all points take the ink of the innermost
+    # sectors
     radius = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
     looked_up = np.minimum(radius, 0.999) if whole else 0.5 * patch.cells[0][1]
     black = patch.is_black(points * (looked_up / radius)[..., None])

@@ -12,9 +12,9 @@ from kpbench.fitting.templates import VIEW_PX, VIEW_REACH, DesignTemplates, view
 from kpbench.types import Float, Float32, Int
 
 OCTAVES = 4
-"""Number of octaves of :func:`sample_surroundings`; they show 32, 64, 128 and 256 px of the image."""
+"""Number of octaves of :func:`sample_surroundings`: squares of 32, 64, 128 and 256 px of the image."""
 INK_LIMIT = 2.5
-"""Range ± to which the inks of a view are clipped; white is 1 and black is -1."""
+"""The inks of a view are clipped to ± this limit; white is 1 and black is -1."""
 HALF_CONTRAST_RANGE = (2.0, 128.0)
 """Range to which a measured half contrast is clipped, grey levels."""
 
@@ -22,7 +22,7 @@ HALF_CONTRAST_RANGE = (2.0, 128.0)
 def rectify(
     levels: Sequence[Float32], xy: Float, A: Float, design: Int, templates: DesignTemplates
 ) -> tuple[Float32, Float]:
-    """Show the image in the frame of N patches: upright, without tilt, and in units of the patch's own inks.
+    """Return views of the image in the frames of N patches: upright, without tilt, in units of the patch's own inks.
 
     Parameters
     ----------
@@ -37,11 +37,11 @@ def rectify(
     Returns
     -------
     views : ndarray of shape (N, VIEW_PX²), float32
-        Ink, white 1 and black -1 by a least-squares line through the disc, clipped to ±INK_LIMIT; nan outside the
-        image.
+        Ink, clipped to ±INK_LIMIT; nan outside the image. White is 1 and black is -1, by a least-squares line over the
+        pixels of the disc.
     half_contrast : ndarray of shape (N,)
-        Half the difference of the inks, grey levels, clipped to ``HALF_CONTRAST_RANGE``. Where white is darker than
-        black it is the lower limit.
+        Half the difference of white and black, grey levels, clipped to ``HALF_CONTRAST_RANGE``. The lower limit stands
+        also for a white that is darker than the black.
     """
     points = view_points()
     px = short_semi_axis(A) * 2 * VIEW_REACH / VIEW_PX
@@ -63,7 +63,7 @@ def rectify(
 
 
 def blur_views(views: Float32, A: Float, blur_px: Float) -> Float32:
-    """Blur views (N, VIEW_PX²) as Gaussian blurs of the image would, by standard deviations ``blur_px`` (N,) px.
+    """Blur views (N, VIEW_PX²) as if the image had Gaussian blurs of standard deviations ``blur_px`` (N,) px.
 
     ``A`` (N, 2, 2) maps the frame of each patch to the image.
     """
@@ -86,7 +86,7 @@ def sample_surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = 
     xy : ndarray of shape (N, 2)
         Places, px.
     A : ndarray of shape (N, 2, 2), optional
-        Map from a px of the result to px of the image, in the finest octave. None: one to one.
+        Map from px of the result's finest octave to px of the image. None: the identity.
 
     Returns
     -------
