@@ -37,6 +37,7 @@ LEAST_PHOTO_PX = 8
 @dataclass(frozen=True)
 class SampleConfig:
     """Kind, size and number of the samples of a training.
+
     Attributes
     ----------
     kind : str
