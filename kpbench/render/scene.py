@@ -71,7 +71,7 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
     Returns
     -------
     vertices : ndarray of shape (3, N)
-        Homogeneous coordinates; first the vertices of the black areas, then those of the disc.
+        Homogeneous coordinates; first the vertices of the black areas, then the vertices of the disc.
     next_vertex : ndarray of shape (N,)
         Index of the vertex that follows on the same polygon.
     black_count, disc_count : int

@@ -71,7 +71,7 @@ class SampleConfig:
 
 
 class Batch(NamedTuple):
-    """B samples.
+    """Images and keypoints of B samples; each sample has K rows of keypoints.
 
     Attributes
     ----------
