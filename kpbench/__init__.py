@@ -1,7 +1,7 @@
 """kpbench: design, print, synthesise, find and score keypoint patches.
 
-The public names stand in ``__init__.pyi`` and are imported when they are first used: ``import kpbench`` loads neither
-torch, h5py, onnxruntime, OpenCV nor pandas.
+``__init__.pyi`` lists the public names. Each name is imported at its first use: ``import kpbench`` alone loads none of
+torch, h5py, onnxruntime, OpenCV and pandas.
 
 Examples
 --------
@@ -16,7 +16,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """Return a public name. The first use parses ``__init__.pyi``: the command line starts without it."""
+    """Return a public name. Only the first use parses ``__init__.pyi``, so that the command line starts faster."""
     import lazy_loader
 
     this = globals()

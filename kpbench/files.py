@@ -24,7 +24,8 @@ _IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": 
 def shipped_folder(name: str) -> Path:
     """Return the folder of data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
 
-    A checkout holds the data where people edit them. An installed package holds all data in one folder.
+    A checkout holds the data in the folders where people edit the data. An installed package holds all data in one
+    folder.
     """
     installed = PACKAGE / "shipped" / name
     return installed if installed.is_dir() else PACKAGE.parent / _IN_CHECKOUT[name]
@@ -33,8 +34,8 @@ def shipped_folder(name: str) -> Path:
 def image_files(folder: Path, exclude: Path | None = None) -> tuple[str, ...]:
     """Return the paths of all images below a folder, relative to the folder.
 
-    The paths are sorted. Every machine therefore gives the same order. Images below the folder ``exclude`` are left
-    out: results are written to that folder.
+    The paths are sorted. Every machine therefore gives the same order. ``exclude`` : folder of results; images below
+    this folder are left out.
     """
     files = [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file()]
     if exclude is not None:
@@ -76,7 +77,7 @@ def sha256_of(path: Path) -> str:
 def folder_at(place: str | Path) -> Path:
     """Return the folder at a path, or at a URL such as ``s3://bucket/name``.
 
-    fsspec reads and writes folders at URLs. The result behaves like a path in both cases.
+    fsspec reads and writes folders at URLs. The result behaves like a path, also for a URL.
 
     Raises
     ------
@@ -102,7 +103,7 @@ def folder_at(place: str | Path) -> Path:
 
 
 def is_local(path: object) -> bool:
-    """Return whether a path belongs to the file system of this machine, and not to a URL."""
+    """Return whether a path belongs to the file system of this machine. A path at a URL does not."""
     return isinstance(path, (str, Path))
 
 
@@ -158,8 +159,8 @@ def make_folder(folder: Path) -> Path:
 def write_atomic(path: Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all.
 
-    On this machine: write a temporary file in the same folder, fsync the file, rename it, fsync the folder. At a URL:
-    put the file in one piece. Object stores write one piece whole or not at all.
+    On this machine: write a temporary file in the same folder, fsync the file, rename the file, fsync the folder. At a
+    URL: write the file with a single call. Object stores carry out such a call wholly or not at all.
 
     Raises
     ------
@@ -196,7 +197,7 @@ def write_atomic(path: Path, data: bytes | memoryview) -> None:
 
 @contextmanager
 def _remote_errors(path: Path) -> Iterator[None]:
-    """Turn every error of a remote file system into one line."""
+    """Turn every error of a remote file system into a :class:`DataError` with a message of one line."""
     try:
         yield
     except Exception as error:

@@ -30,7 +30,7 @@ def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
 
 @contextmanager
 def name_source(source: str | Path, error: type[KpbenchError]) -> Iterator[None]:
-    """Put the name of a file before the message of each :class:`KpbenchError`, and raise it as ``error``."""
+    """Put the name of a file before the message of each :class:`KpbenchError`, and raise the message as ``error``."""
     try:
         yield
     except KpbenchError as problem:
@@ -41,8 +41,8 @@ def name_source(source: str | Path, error: type[KpbenchError]) -> Iterator[None]
 class TomlTable:
     """A table whose keys are known.
 
-    A method returns the checked value of a key. If the table lacks the key, the method returns the default. Without a
-    default, it raises an error.
+    A method returns the checked value of a key. If the table lacks the key, the method returns the default. A method
+    without a default raises an error.
 
     Attributes
     ----------
@@ -119,14 +119,14 @@ class TomlTable:
     def numbers(
         self, key: str, low: float, high: float = math.inf, count: int | None = None, whole: bool = False
     ) -> tuple[float, ...]:
-        """Return a list of numbers from ``low`` to ``high``; ``count`` is the length of the list, None for any."""
+        """Return numbers from ``low`` to ``high``; ``count`` is the required number of numbers, None for any."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple) or count not in (None, len(value)):
             raise self.problem(key, f"a list of {'' if count is None else f'{count} '}numbers")
         return tuple(self._number(f"{key}[{n}]", entry, low, high, whole) for n, entry in enumerate(value))
 
     def span(self, key: str, low: float, high: float) -> tuple[float, float]:
-        """Return (least, most). The file holds ``[least, most]``, or one number that stands for both."""
+        """Return (least, most). The file holds ``[least, most]``, or one number that is both least and most."""
         if not isinstance(self.values.get(key), list):
             value = self.number(key, low, high)
             return value, value

@@ -1,7 +1,7 @@
 """Patches before a background: a clean image and its truth.
 
-Two kinds of scene: single patches in random poses (``render_scene``), and one board before a camera
-(``render_board``). Both paint by exact area coverage.
+There are two kinds of scene: single patches in random poses (``render_scene``), and one board before a camera
+(``render_board``). Both functions paint by exact area coverage.
 """
 
 import lazy_loader

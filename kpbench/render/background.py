@@ -20,13 +20,13 @@ from kpbench.images import decode_photo
 from kpbench.types import Float, UInt8
 
 CACHE_BYTES = 128 * 2**20
-"""Most memory that the decoded photographs of a :class:`PhotoFolder` take, bytes."""
+"""Largest size of the cache of decoded photographs of a :class:`PhotoFolder`, bytes."""
 LEAVES = 700
 """Number of shapes in a procedural background; together they cover the image about twice."""
 LEAF_RADIUS = (0.008, 0.35)
-"""Smallest and largest radius of such a shape, as a fraction of the image's longer side."""
+"""Smallest and largest radius of a shape in a procedural background, as fractions of the image's longer side."""
 TEXTURE_OCTAVES = 7
-"""Number of layers of smooth noise in a procedural background; each has half the resolution of the one before."""
+"""Number of layers of smooth noise in a procedural background; the resolution halves from layer to layer."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,9 @@ class Background:
     image : ndarray of shape (H, W) or (H, W, 3), uint8
         Grey or RGB.
     file : str
-        Path of the photograph below its folder, "" for a procedural background.
+        Path of the photograph below its folder; "" for a procedural background.
     broken_files : tuple of str
-        Files that were drawn first and could not be decoded.
+        Files that were tried before and could not be decoded.
     """
 
     image: UInt8
@@ -58,7 +58,7 @@ class PhotoFolder:
     ----------
     path : Path
     files : tuple of str
-        Sorted paths below ``path``, so that the n-th file is the same on every machine.
+        Paths below ``path``, sorted so that the n-th file is the same on every machine.
 
     Examples
     --------
@@ -101,7 +101,7 @@ class PhotoFolder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the names and sizes of all files, which shows whether the folder has changed."""
+        """SHA-256 over the names and sizes of all files; it shows whether the folder has changed."""
         listing = "\n".join(f"{name}\t{(self.path / name).stat().st_size}" for name in self.files)
         return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
@@ -133,15 +133,14 @@ class PhotoFolder:
         return image
 
     def _files_from(self, first: int) -> Iterator[str]:
-        """Yield all files, from the one with number ``first`` to the end, then from the start."""
+        """Yield all files, first from position ``first`` to the end, then from the start."""
         yield from self.files[first:]
         yield from self.files[:first]
 
     def sample(self, rng: np.random.Generator, width_px: int, height_px: int, channels: int) -> Background:
         """Draw a random crop of a random photograph, mirrored with probability 0.5 and resized.
 
-        In place of a broken file the next file of the list is taken. The random numbers that are drawn do
-        therefore not depend on which files are broken.
+        The next file of the list replaces a broken file. Broken files therefore do not change the random numbers.
 
         Parameters
         ----------
@@ -174,7 +173,7 @@ class PhotoFolder:
 
 
 def describe_backgrounds(photos: PhotoFolder | None) -> dict[str, Any]:
-    """Return what the config of a dataset says about the backgrounds, without a path."""
+    """Return the entry of a dataset's config that describes the backgrounds; the entry holds no path."""
     if photos is None:
         return {"kind": "procedural"}
     return {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
@@ -185,7 +184,7 @@ def _crop_and_resize(
 ) -> UInt8:
     """Cut a window out of a photograph and resize the window.
 
-    ``zoom`` is the size of the window relative to the largest one that fits. The two fractions place the
+    ``zoom`` is the size of the window relative to the largest window that fits. The two fractions place the
     window: 0 at the left or upper border, 1 at the right or lower border.
     """
     rows, columns = photo.shape[:2]
@@ -247,7 +246,7 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
 
 
 def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
-    """Draw smooth noise and sum it over all octaves, ndarray of shape (height_px, width_px), float32, grey levels."""
+    """Return the sum of smooth noise over all octaves: shape (height_px, width_px), float32, grey levels."""
     strength = rng.uniform(2, 14)
     sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
     octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
@@ -274,7 +273,7 @@ def _place_polygon(
     corners : ndarray of shape (k, 2)
     centre_px : ndarray of shape (n, 2)
     radius_px, ratio, angle_deg : ndarray of shape (n,)
-        Semi-axis along x before the turn, semi-axis along y as a fraction of it, and the turn.
+        Semi-axis along x before the turn, ratio of the semi-axis along y to the semi-axis along x, and the turn.
 
     Returns
     -------

@@ -1,6 +1,6 @@
 """Poses of a board, and the exact projection of a board into the image, with lens distortion.
 
-A pose is found from the quantity that the experiments fix: the share of the image that the board covers.
+A pose is found for a given share of the image that the board covers, because the experiments fix this share.
 :mod:`kpbench.geometry` describes the frames.
 """
 
@@ -20,9 +20,9 @@ from kpbench.types import Float
 FREE_MARGIN = 0.01
 """Width of the border of the image that stays free of the board, in image widths."""
 LONGEST_PIECE_PX = 8.0
-"""Longest straight piece of a projected outline where the lens bends lines, px."""
+"""Longest straight piece of a projected outline if the lens bends lines, px."""
 MOST_PIECES = 400
-"""Most such pieces of one straight edge."""
+"""Largest number of straight pieces of one edge of the board."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def pose_board(
     roll_deg: float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Pose:
-    """Place a board so that it covers a given share of the image, whatever its tilt.
+    """Place a board at any tilt so that the board covers a given share of the image.
 
     Parameters
     ----------
@@ -131,7 +131,8 @@ def pose_board(
     >>> pose.t_camera.round().tolist()
     [0.0, 0.0, 283.0]
     """
-    # rotation_xyz turns +y (down) away from the camera for a positive x, and +x towards it for a positive y
+    # a positive x angle of rotation_xyz turns +y (down) away from the camera; a positive y angle turns +x towards the
+    # camera
     R = rotation_xyz(0, -yaw_deg, 0) @ rotation_xyz(-pitch_deg, 0, 0) @ rotation_xyz(0, 0, roll_deg)
     size = np.array([camera.width_px, camera.height_px])
     margin_px = FREE_MARGIN * camera.width_px
@@ -146,7 +147,7 @@ def pose_board(
 
 
 def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px: float) -> float:
-    """Find the distance along the optical axis, mm, at which the board's image has an area."""
+    """Find the distance along the optical axis, mm, at which the board covers ``area_px`` square pixels."""
 
     def solve(lens: Camera, nearest_mm: float, farthest_mm: float) -> float:
         def log_area_ratio(log_depth: float) -> float:
@@ -162,7 +163,7 @@ def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px:
         depth_mm = solve(replace(camera, distortion=NO_DISTORTION), nearest_mm, 4 * frontal_mm)
         if not any(camera.distortion):
             return depth_mm
-        # the polynomial of the lens holds in and near the image only: search near the pinhole's answer
+        # the lens polynomial is valid only in and near the image, so search near the depth without distortion
         return solve(camera, max(nearest_mm, 0.7 * depth_mm), 1.5 * depth_mm)
     except ValueError:
         raise DataError(f"no distance gives a board an image of {area_px:.0f} px at this tilt and lens") from None

@@ -1,7 +1,7 @@
 """Views of a board before a camera: light, exact rendering, and the truth.
 
-Ink and paper are projected as outlines and painted by exact area coverage, so that a board of 0.5 % of the image
-is not aliased.
+Ink and paper are projected as outlines and painted by exact area coverage. Even a board that covers 0.5 % of the image
+is therefore not aliased.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SHADOW_BLUR = 0.05
 SHADOW_GRID = 64
 """Pixels per board side of the coarse grid on which the shadow is computed."""
 RIM_POINTS = 720
-"""Points on a disc's rim from which the moments of its distorted image are computed."""
+"""Number of points on a disc's rim from which the moments of the disc's distorted image are computed."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ class Appearance:
     Attributes
     ----------
     black, white : float
-        Grey levels of the two inks under full light; paper is white.
+        Grey levels of the two inks under full light; the paper has the grey level ``white``.
     edge : float
-        Brightness of the cut edge relative to white.
+        Brightness of the cut edge, as a fraction of ``white``.
     light : float
         Brightness at the board's centre, 0 to 1.
     slope : (float, float)
@@ -70,9 +70,9 @@ class Appearance:
 def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any]:
     """Compute the truth of every keypoint of a board that lies wholly in the image.
 
-    A distorting lens maps no disc to an exact ellipse. ``H_patch2image`` is then the homography that agrees
-    with the lens at the keypoint to first order. The axes are those of the ellipse that has the second
-    moments of the disc's exact image.
+    A distorting lens maps no disc to an exact ellipse. For such a lens, ``H_patch2image`` is the homography that
+    agrees with the lens at the keypoint to first order, and the semi-axes belong to the ellipse with the same second
+    moments as the disc's exact image.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
 
 
 def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
-    """Project points of the unit circle, evenly spaced on the patch, shape (RIM_POINTS, 2), px."""
+    """Project evenly spaced points of the patch's unit circle into the image, shape (RIM_POINTS, 2), px."""
     angles = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.ones(RIM_POINTS)])
     return camera.project(rim @ M_patch2camera.T)
@@ -138,7 +138,7 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike
     Parameters
     ----------
     background : ndarray of shape (H, W) or (H, W, 3), uint8
-        Of the camera's size; not changed.
+        As large as the camera's image; not changed.
     camera : Camera
     pose : Pose
     board : Board or TagBoard
@@ -195,14 +195,14 @@ def _cover(
     Parameters
     ----------
     outline, face : ndarray of shape (n, 2)
-        The board with and without the band along its cut edge, px.
+        Outline of the board with and without the band along its cut edge, px.
     inks, discs : list of lists of ndarray of shape (n, 2)
         Black areas and patches, px.
 
     Returns
     -------
     box : Box
-        The part of the image that holds everything.
+        The part of the image that holds the whole board.
     board, face, black : ndarray of shape (height, width)
         Covered fraction of each pixel of the box.
     masks : tuple of Mask
@@ -240,7 +240,7 @@ def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: flo
 def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Appearance) -> None:
     """Darken the scene behind the board, in place.
 
-    The shadow is smooth: it is computed on a coarse grid and enlarged.
+    The shadow is smooth, so that a coarse grid suffices: the shadow is computed on the grid and enlarged.
     """
     step = max(1, round(side_px / SHADOW_GRID))  # px per pixel of the coarse grid
     blur = SHADOW_BLUR * side_px / step

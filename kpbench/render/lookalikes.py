@@ -1,4 +1,4 @@
-"""Look-alikes: shapes that a detector may take for a patch, such as discs, rings, chequers, text and half-patches.
+"""Look-alikes: shapes that a detector may mistake for a patch, such as discs, rings, chequers, text and half-patches.
 
 Look-alikes carry no label: a detector must not report them. OpenCV draws them, without exact edges.
 """
@@ -98,7 +98,7 @@ def _to_sixteenths(points: Float) -> np.ndarray[tuple[int, ...], np.dtype[np.int
 
 
 def _fill_ellipse(image: UInt8, lookalike: Lookalike, scale: float, level: float, end_deg: float = 360) -> None:
-    """Fill the ellipse of a look-alike, scaled about its centre; with ``end_deg`` 180 only one half."""
+    """Fill the ellipse of a look-alike, scaled about its centre; an ``end_deg`` of 180 fills only one half."""
     centre = (round(lookalike.x * 16), round(lookalike.y * 16))
     axes = (round(lookalike.radius * scale * 16), round(lookalike.radius * lookalike.ratio * scale * 16))
     cv2.ellipse(image, centre, axes, lookalike.angle_deg, 0, end_deg, _colour(image, level), -1, cv2.LINE_AA, 4)
@@ -144,7 +144,7 @@ def _draw_bar(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> N
 
 
 def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
-    """Draw a chequer board: each corner looks like the patch ``checker``, but has neighbours."""
+    """Draw a chequer board. Each inner corner looks like the patch ``checker``, but has neighbours."""
     rows, columns = (int(v) for v in rng.integers(3, 8, 2))
     side = min(lookalike.radius, 18.0)
     A = _rotation(lookalike.angle_deg) @ np.diag([side, side * max(lookalike.ratio, 0.5)])
@@ -157,20 +157,20 @@ def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike)
 
 
 def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalike, patch: Patch) -> None:
-    """Draw one side of a patch, cut off beside its centre, so that the keypoint itself is missing."""
+    """Draw a patch without the part on one side of a cut. The cut-off part holds the centre, which is the keypoint."""
     black, disc = unit_polygons(patch, 2.0**-8)
     cut = float(rng.uniform(0.15, 0.4))  # distance from the centre to the cut, in radii
     spin = _rotation(float(rng.uniform(0, 360)))
     A = _rotation(lookalike.angle_deg) @ np.diag([1, lookalike.ratio]) * lookalike.radius
     light, dark = max(lookalike.ink, lookalike.second_ink), min(lookalike.ink, lookalike.second_ink)
     for polygons, level in ((disc, light), (black, dark)):
-        # vertices beyond the cut move onto the cut, where the part that they enclose has no area
+        # vertices in the cut-off part move onto the cut, so that this part of a polygon loses its area
         kept = [np.maximum(polygon @ spin.T, (cut, -np.inf)) @ A.T + (lookalike.x, lookalike.y) for polygon in polygons]
         cv2.fillPoly(image, [_to_sixteenths(points) for points in kept], _colour(image, level), cv2.LINE_8, 4)
 
 
 def _rotation(angle_deg: float) -> Float:
-    """Return the rotation matrix from +x towards +y, ndarray of shape (2, 2)."""
+    """Return the matrix of a rotation from +x towards +y, ndarray of shape (2, 2)."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     return np.array([[c, -s], [s, c]])
 
@@ -184,4 +184,4 @@ DRAWERS: tuple[Callable[[UInt8, np.random.Generator, Lookalike], None], ...] = (
     _draw_bar,
     _draw_chequers,
 )
-"""Functions that draw one look-alike each. A half-patch is the kind after the last: it takes the designs too."""
+"""Functions that draw one look-alike each. :func:`draw_lookalikes` also draws half-patches, which need a design."""

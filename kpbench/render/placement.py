@@ -14,16 +14,16 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float
 
 GAP_PX = 2.0
-"""Smallest distance between two patches of a random scene, px."""
+"""Smallest gap between the rims of two patches of a random scene, px."""
 PLACEMENT_ROUNDS = 25
-"""Most rounds of the search for free places in a random scene; one round is mostly enough."""
+"""Largest number of rounds in the search for free places in a random scene; usually one round is enough."""
 LARGEST_DEPTH_CHANGE = 0.5
 """Largest change of depth from a disc's centre to its rim, relative to the depth of the centre."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges within which a random scene is drawn. The defaults are the paper's where the paper gives any (§3.2).
+    """Ranges within which a random scene is drawn. Where the paper gives a range (§3.2), this range is the default.
 
     Attributes
     ----------
@@ -67,13 +67,13 @@ class Limits:
         least, most = self.radius_px
         if not 1 <= least <= most <= 4096:
             raise DataError(f"`radius_px` is {least:g}:{most:g}, expected px from 1 to 4096, the smaller first")
-        if 2 * most < 1.2 * self.minor_axis_px:  # else hardly any tilt keeps the short axis
+        if 2 * most < 1.2 * self.minor_axis_px:  # with smaller radii, hardly any tilt keeps the short axis long enough
             expected = f"expected a largest of at least {0.6 * self.minor_axis_px:g}: no short axis is under"
             raise DataError(f"`radius_px` is {least:g}:{most:g}, {expected} {self.minor_axis_px:g} px")
 
     @classmethod
     def of_radius(cls, least_px: float, most_px: float) -> Limits:
-        """Make limits for a range of radii, small ones included.
+        """Make limits for a range of radii that may start below the default.
 
         Parameters
         ----------
@@ -84,7 +84,7 @@ class Limits:
         Raises
         ------
         DataError
-            If the two are no range of radii, or ``most_px`` is less than 1.2 times the short semi-axis.
+            If the two are no range of radii, or if ``most_px`` is less than 1.2 times the least short semi-axis.
 
         Examples
         --------
@@ -141,7 +141,7 @@ def random_placements(
     Returns
     -------
     list of Placement
-        One per patch; fewer than the drawn number of patches if the image is too full.
+        One placement per patch. A full image gets fewer patches than the number that was drawn.
 
     Examples
     --------
@@ -165,7 +165,7 @@ def random_placements(
         H_extent2image = poses * np.stack([extent, extent, np.ones(candidates)], axis=1)[:, None]
         centre, reach, _, _ = project_discs(H_extent2image)
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
-            # the wide rim of a steep patch may reach the horizon, and has no ellipse then
+            # the wide rim of a steep patch may reach the horizon, and then projects to no ellipse
             has_ellipse = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
             is_free = all(math.hypot(x - x0, y - y0) > r + r0 + GAP_PX for x0, y0, r0 in circles)
             if len(placements) < count and has_ellipse and is_free:
@@ -216,11 +216,11 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
 
 
 def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, cx_px: float, cy_px: float) -> Float:
-    """Compute the first two columns of ``K [r1 r2 t] / depth``, ndarray of shape (n, 3, 3); the third is not set.
+    """Compute the first two columns of ``K [r1 r2 t] / depth``, shape (n, 3, 3); the third column is not set.
 
-    The depth is focal / radius, in disc radii. The rotation is that of
-    :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]``
-    about x; angles in rad. (cx_px, cy_px) is the principal point.
+    The depth is ``focal_px / radius_px``, in disc radii. The rotation is made as in
+    :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]`` about x,
+    in rad. (cx_px, cy_px) is the principal point.
     """
     (cx, cy), (sx, sy), cz, sz = np.cos(tilt), np.sin(tilt), np.cos(turn), np.sin(turn)
     H = np.empty((len(turn), 3, 3))

@@ -17,7 +17,7 @@ from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 WHOLLY_COVERED = 1 - 1e-6
-"""Least coverage of a pixel that lies wholly on a patch; the rest is rounding."""
+"""Least computed coverage of a pixel that lies wholly on a patch; the difference to 1 allows for rounding."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
     Returns
     -------
     vertices : ndarray of shape (3, N)
-        Homogeneous coordinates; first the vertices of the black areas, then those of the disc.
+        Homogeneous coordinates; first the vertices of the black areas, then the vertices of the disc.
     next_vertex : ndarray of shape (N,)
         Index of the vertex that follows on the same polygon.
     black_count, disc_count : int
@@ -103,7 +103,7 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
         return []
     poses = np.stack([p.H_patch2image for p in placements])
     _, major, _, _ = project_discs(poses)
-    # rounded down to a power of two, so that patches of similar size share their polygons
+    # rounded down to a power of two, so that patches of similar size share the cached polygons
     tolerances = 2.0 ** np.floor(np.log2(tolerance_px / major))
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     for p, tolerance in zip(placements, tolerances, strict=True):
@@ -120,7 +120,7 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
 
 
 def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendering:
-    """Draw patches onto a background with exact area coverage; edges are true to 1/1000 px.
+    """Draw patches onto a background with exact area coverage; the edges are accurate to 1/1000 px.
 
     Parameters
     ----------
@@ -208,10 +208,10 @@ def fraction_inside(image: UInt8, mask: Mask) -> float:
 
 
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
-    """Measure white minus black of each patch in an image.
+    """Measure the contrast of each patch in an image: white minus black.
 
-    The contrast is minus the slope of a least-squares line: grey level over the black fraction of each pixel that
-    lies wholly on the patch. Noise does not bias it; blur and shadow lower it.
+    A line is fitted by least squares to the pixels that lie wholly on the patch: grey level against black fraction.
+    The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower it.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     Returns
     -------
     ndarray of shape (n,), float64
-        Grey levels; nan where nothing of the patch, or only one of its inks, is in the image.
+        Grey levels; nan if the image shows nothing of the patch or only one of its inks.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The last steps of every synthetic image: degrade a rendered scene and carry its truth along."""
+"""The last steps of every synthetic image: degrade a rendered scene and update its truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kpbench.types import Float, UInt8
 
 
 def discs_of(keypoints: NDArray[Any]) -> Float:
-    """Return x, y and radius (px) of each keypoint's patch, shape (n, 3): the targets of effects that aim."""
+    """Return x, y and radius (px) of each keypoint's patch, shape (n, 3), for effects that are aimed at patches."""
     return np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
 
 
@@ -37,8 +37,8 @@ def degrade_scene(scene: Rendering, rng: np.random.Generator, effects: Sequence[
     Returns
     -------
     Rendering
-        Poses are the same, as no effect moves the image. Occlusions lower ``visible``; ``contrast`` is measured in
-        the degraded image.
+        The poses are unchanged, because no effect moves the image. Occlusions lower ``visible``; ``contrast`` is
+        measured in the degraded image.
     """
     image, keypoints = apply_effects(scene.image, rng, effects), scene.keypoints.copy()
     keypoints["visible"] *= unoccluded_fraction(image, effects, scene.masks)
@@ -58,16 +58,16 @@ def augment_scene(
     placements : sequence of Placement
         The patches of the scene.
     effects : sequence of dict
-        The effects that were applied: a patch keeps the fraction that occlusions left visible.
+        Records of the effects that degraded the scene. Occlusions among them lower ``visible``.
     pipeline : str
         From :func:`kpbench.synth.load_augmentation`.
     seed : int
-        Seed of all that the pipeline draws.
+        Seed of the pipeline's random numbers.
 
     Returns
     -------
     Rendering
-        Without the patches whose centre has left the image.
+        The moved scene. Patches whose centre has left the image are left out.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def unoccluded_fraction(image: UInt8, effects: Sequence[Effect], masks: Sequence
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
-        Parts of a patch outside the image do not count.
+        Parts of a patch outside this image do not count.
     effects : sequence of dict
         Records of effects; only occlusions matter.
     masks : sequence of Mask

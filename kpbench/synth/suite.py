@@ -1,9 +1,9 @@
 """Suites: the configuration that determines every image of a benchmark suite, and how one image is made.
 
 Image and truth are a function of the suite, the seed, the size, the lens and the background files.
-A base scene consists of background, pose, inks and light. Every scene is seen with every patch under every
-rung; its images share their ``scene_id`` and the random numbers of the effects. Comparisons are therefore
-paired.
+A base scene consists of background, pose, inks and light. Every base scene is shown with every patch under every
+rung. All images of a base scene share their ``scene_id`` and the random numbers of the effects. Comparisons are
+therefore paired.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float
 
 BOARD_SIDE_MM = 187.5
-"""Side of every board: a disc of the hexagon board then has 30 mm."""
+"""Side of every board, mm; a patch of a hexagon board of this size has a diameter of 30 mm."""
 
 
 @dataclass(frozen=True)
@@ -81,19 +81,20 @@ class SuiteConfig:
     ----------
     suite : Suite
     images : int or None
-        Number of base scenes, None for the suite's own number. A smaller number gives the first of the same scenes.
+        Number of base scenes; None for the suite's own number. A smaller number gives the first base scenes.
     seed : int
         0 or more.
     size_px : (int, int) or None
-        Width and height, None for the suite's own. The horizontal field of view stays the same.
+        Width and height; None for the suite's own. The horizontal field of view does not depend on ``size_px``.
     only : tuple of str
-        Names of the conditions to make; all if empty.
+        Names of the conditions to make; an empty tuple makes all conditions.
     backgrounds : Path or None
         Folder of photographs, or None for procedural backgrounds.
     distortion : tuple of float
-        Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; the others are 0.
+        Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; missing coefficients are 0.
     board : str or None
-        A name of :data:`kpbench.patches.TAG_BOARDS`, to show that board of tags and no patches.
+        Name of a board of tags in :data:`kpbench.patches.TAG_BOARDS`, which replaces the boards of patches. None:
+        boards of patches.
     shard_size : int
         Images per shard; changes the files but no image.
 
@@ -158,7 +159,7 @@ class SuiteConfig:
 
     @cached_property
     def rungs(self) -> tuple[tuple[Condition, int], ...]:
-        """Every rung in the order of the images: its condition, and its position among the condition's rungs."""
+        """Condition and position within the condition of every rung, in the order of the images."""
         chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
@@ -186,7 +187,7 @@ class SuiteConfig:
 
     @cached_property
     def photos(self) -> PhotoFolder | None:
-        """The opened folder of photographs, None for procedural backgrounds."""
+        """The opened folder of photographs; None for procedural backgrounds."""
         return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
 
     @cached_property
@@ -200,7 +201,7 @@ class SuiteConfig:
     def to_dict(self) -> dict[str, Any]:
         """Return the config that is written into the dataset.
 
-        It holds no path, so that a moved background folder gives the same bytes.
+        The config holds no path, so that a moved background folder gives the same bytes.
         """
         camera, conditions = self.camera, {c.name: c for c, _ in self.rungs}.values()
         targets: dict[str, Any] = {"patches": [patch.to_dict() for patch in self.suite.patches]}
@@ -223,7 +224,7 @@ class SuiteConfig:
         }
 
     def scene_id(self, index: int) -> int:
-        """Return the base scene of an image: images are ordered by condition, rung, board and scene."""
+        """Return the base scene of an image. Images are ordered by condition, rung, board and base scene."""
         return index % self.scenes
 
     def view(self, index: int) -> View:
@@ -295,9 +296,9 @@ class SuiteConfig:
         return sample, background.broken_files
 
     def _find_background(self, scene_id: int) -> Background:
-        """Return the background of a scene from the cache, or make it.
+        """Return the background of a base scene from the cache, or make the background.
 
-        The cache holds as many backgrounds as a shard has images, because every scene returns under each rung.
+        Every base scene returns under every rung. The cache holds as many backgrounds as a shard has images.
         """
         if scene_id in self._background_cache:
             return self._background_cache[scene_id]
@@ -314,14 +315,14 @@ class SuiteConfig:
 
 
 def _describe_condition(condition: Condition) -> dict[str, Any]:
-    """Return a condition for the config; its effects are a list, because their order counts."""
+    """Return a condition for the config; the effects are a list, because their order matters."""
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]
     return {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
 
 
 def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
-    """Return the board that the images of a suite show, and their camera.
+    """Return the keypoints of the board that the images of a suite show, and the camera of the images.
 
     Parameters
     ----------
@@ -334,7 +335,7 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
         The board's keypoints with z = 0, in the order of the truth.
     camera : Camera
 
-    In place of both, None is returned if the dataset is of no suite.
+    The function returns None, not a tuple, if the dataset was not made from a suite.
 
     Examples
     --------
@@ -351,5 +352,5 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
     camera = Camera(width, height, config["focal_px"], (k1, k2, p1, p2, k3))
     if "board" in config:
         return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
-    # the keypoints of a hexagon board are at the same places for every patch
+    # the keypoints of hexagon boards have the same positions, whatever the patch
     return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera

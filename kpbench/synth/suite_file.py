@@ -31,13 +31,13 @@ SCENE_KEYS = {
     "slope_y": (-1.0, 1.0),
     "shadow": (0.0, 1.0),
 }
-"""Quantities that are drawn for a scene, and the least and most that a suite may ask for.
+"""Quantities that are drawn for a scene, and the range of values that a suite may set for each quantity.
 
-The pose is that of :func:`kpbench.render.pose_board`, inks and light are those of :class:`kpbench.render.Appearance`.
+:func:`kpbench.render.pose_board` explains the pose, :class:`kpbench.render.Appearance` the inks and the light.
 """
 
 Levels = tuple[tuple[str, tuple[float, ...]], ...]
-"""Names, each with one value per rung."""
+"""Names of quantities or effects, each with one value per rung."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Condition:
     ----------
     name, unit : str
     rungs : tuple of float
-        From mild to severe, in ``unit``.
+        Severities from mild to severe, in ``unit``.
     pose : tuple of (str, tuple of float)
         Quantities of the scene that the condition sets, each with one value per rung.
     effects : tuple of (str, tuple of float)
@@ -86,7 +86,7 @@ class Suite:
     pixel_um : float
         Side of a pixel.
     scene : tuple of (str, (float, float))
-        Least and most of each quantity that is drawn for a scene, see :data:`SCENE_KEYS`.
+        Name, least value and greatest value of each quantity that is drawn for a scene, see :data:`SCENE_KEYS`.
     conditions : tuple of Condition
 
     Examples
@@ -107,14 +107,14 @@ class Suite:
     conditions: tuple[Condition, ...]
 
     def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
-        """Return the camera, at another image size with the same horizontal field of view if one is given.
+        """Return the camera of the suite, or a camera of another image size with the same horizontal field of view.
 
         Parameters
         ----------
         size_px : (int, int), optional
-            Width and height.
+            Width and height of the image. None: the suite's own.
         distortion : tuple of float
-            Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; the others are 0.
+            Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; missing coefficients are 0.
         """
         width, height = size_px or self.size_px
         focal_px = self.lens_mm / (self.pixel_um / 1000) * width / self.size_px[0]
@@ -123,7 +123,7 @@ class Suite:
 
 
 def shipped_suites() -> dict[str, Path]:
-    """Return the files of the suites that ship with kpbench, by the suites' names.
+    """Return the files of the suites that ship with kpbench, keyed by the suites' names.
 
     Examples
     --------

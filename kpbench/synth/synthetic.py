@@ -49,14 +49,14 @@ class SynthConfig:
         1 for grey, 3 for RGB.
     deteriorate : {"none", "paper", "ladder"}
         How the scenes are degraded: not at all, by :func:`kpbench.degrade.draw_paper_mix`, or by
-        :func:`kpbench.degrade.draw_ladder_mix`. The scenes themselves do not depend on it.
+        :func:`kpbench.degrade.draw_ladder_mix`. The scenes themselves do not depend on ``deteriorate``.
     shard_size : int
         Images per shard; changes the files but no image.
     backgrounds : Path or None
         Folder of photographs, or None for procedural backgrounds.
     distractors : int
         Largest number of look-alikes per image, see :func:`kpbench.render.draw_lookalikes`. The patches of a scene
-        do not depend on it.
+        do not depend on ``distractors``.
     augmentation : str or None
         An albumentations pipeline from :func:`kpbench.synth.load_augmentation`, applied last.
     limits : Limits
@@ -118,13 +118,13 @@ class SynthConfig:
 
     @cached_property
     def photos(self) -> PhotoFolder | None:
-        """The opened folder of photographs, None for procedural backgrounds."""
+        """The opened folder of photographs; None for procedural backgrounds."""
         return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config that is written into the dataset.
 
-        It holds no path, so that a moved background folder gives the same bytes.
+        The config holds no path, so that a moved background folder gives the same bytes.
         """
         return {
             "kind": "synth",
@@ -148,7 +148,7 @@ class SynthConfig:
         return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
 
     def scene_id(self, index: int) -> int:
-        """Return the base scene of an image: every image is a scene of its own."""
+        """Return the base scene of an image; every image has its own base scene."""
         return index
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:

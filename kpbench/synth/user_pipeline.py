@@ -1,6 +1,6 @@
-"""The user's own albumentations pipeline, applied to a scene with its truth carried along.
+"""The user's own albumentations pipeline, applied to a scene and to its truth.
 
-Albumentations can move keypoints itself, but not as accurately as kpbench needs: its resizing transforms are off
+Albumentations can move keypoints itself, but not as accurately as kpbench needs. Its resizing transforms are off
 by half a pixel times the change of scale, and its distortions lose points. Instead, the coordinates of all pixels
 go through the pipeline as a mask, which is resampled like the image. A homography, fitted to the coordinates
 within a disc, then moves the whole patch.
@@ -27,9 +27,9 @@ from kpbench.render.placement import Placement
 from kpbench.types import UInt8
 
 LEAST_IMAGE_SHARE = 0.999
-"""Least fraction of a pixel that must come from the image; a transform may fill in the rest."""
+"""Least fraction of a pixel that must come from the image; the transform fills in the rest."""
 LEAST_DISC_PIXELS = 12
-"""Fewest pixels of a disc to which a homography is fitted; with fewer, the patch has left the image."""
+"""Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
 
 def load_augmentation(path: str | Path) -> str:
@@ -85,7 +85,7 @@ def _build_pipeline(canonical: str) -> Any:
 
 
 def _interpolate_masks(transform: Any) -> None:
-    """Make a pipeline resample masks like images; its default is the nearest pixel."""
+    """Make a pipeline interpolate masks linearly; by default, albumentations takes the nearest pixel."""
     for part in getattr(transform, "transforms", ()):
         _interpolate_masks(part)
     if hasattr(transform, "mask_interpolation"):
@@ -105,13 +105,13 @@ def run_pipeline(
     pipeline : str
         From :func:`load_augmentation`.
     seed : int
-        Seed of all that the pipeline draws.
+        Seed of the pipeline's random numbers.
 
     Returns
     -------
     image : ndarray of the same shape, uint8
     placements : list of (Placement or None)
-        The same patches at their new poses; None if the patch's centre has left the image.
+        The same patches at their new poses; None for a patch whose centre has left the image.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def run_pipeline(
 
 @lru_cache(maxsize=2)
 def _pixel_coordinates(height: int, width: int) -> NDArray[np.float32]:
-    """Return x and y of each pixel (px), and a 1 that marks the pixel as the image's own: shape (H, W, 3)."""
+    """Return x, y and 1 for each pixel, shape (H, W, 3); x and y are in px, the 1 marks a pixel of the image."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
@@ -152,7 +152,7 @@ def _move_placement(placement: Placement, source_px: NDArray[np.float32]) -> Pla
     ----------
     placement : Placement
     source_px : ndarray of shape (H, W, 3), float32
-        :func:`_pixel_coordinates` after the move: where the content of each pixel was before.
+        :func:`_pixel_coordinates` after the move: the former position of each pixel's content.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def _move_placement(placement: Placement, source_px: NDArray[np.float32]) -> Pla
     if len(rows) < LEAST_DISC_PIXELS:
         return None
     after, before = np.column_stack([columns, rows]).astype(np.float64), source_px[rows, columns, :2].astype(np.float64)
-    middle = after.mean(axis=0)  # both sets of points are centred, which conditions the fit well
+    middle = after.mean(axis=0)  # both sets of points are centred, which keeps the fit well conditioned
     fit = cv2.findHomography(before - H[:2, 2], after - middle, 0)[0]
     if fit is None:
         return None
@@ -176,7 +176,7 @@ def _move_placement(placement: Placement, source_px: NDArray[np.float32]) -> Pla
         raise DataError(
             "`augmentation`: mirrors or tears patches, which makes them other designs; leave flips, D4 and shuffles out"
         )
-    # where the move is no homography, the pixels nearest to the patch's centre decide where the centre goes
+    # if the move is no homography, the pixels nearest to the patch's centre determine the new centre
     innermost = np.argsort((u * u + v * v)[rows, columns] / (w * w)[rows, columns])[:LEAST_DISC_PIXELS]
     residual = (after[innermost] - middle - project(H_move, before[innermost] - H[:2, 2])).mean(axis=0)
     to_patch_centre, from_middle = np.eye(3), np.eye(3)

@@ -1,6 +1,6 @@
-"""Training of the weights: of the detector's network by a recipe, and of the networks of its verification.
+"""Training of the detector's network by a recipe, and of the three networks that verify its candidates.
 
-Everything but :func:`load_recipe` and the configurations needs ``pip install 'kpbench[train]'``.
+Recipes and training samples need no further package. Everything else needs ``pip install 'kpbench[train]'``.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
-"""Training samples, made on the fly: a batch is a function of configuration, seed and index.
+"""Training samples, made on the fly. A batch is a function of configuration, seed and index.
 
-There are two kinds of samples. Scenes are whole images as ``kpbench synth`` writes them. Crops
-(:mod:`kpbench.training.crops`) are small windows with degradations whose severity grows during the training.
+There are two kinds of samples. Scenes are whole images, made as ``kpbench synth`` makes them. Crops
+(:mod:`kpbench.training.crops`) are small windows, degraded with a severity that the recipe sets.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from kpbench.types import Float32, UInt8
 from kpbench.workers import run_in_order
 
 VALIDATION_EVERY = 10
-"""One in so many photographs is kept for validation."""
+"""One photograph in this many is kept for validation."""
 PHOTO_PX = 640
-"""Photographs are shrunk to this long side."""
+"""Larger photographs are shrunk to this long side, px."""
 LEAST_PHOTO_PX = 8
-"""Short side of the smallest photograph that is used."""
+"""Photographs with a shorter short side after shrinking, px, are left out."""
 
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """Samples of a training.
+    """Kind, size and number of the samples of a training.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class SampleConfig:
     size : (int, int)
         Width and height of a sample, px; multiples of 8.
     set_size : int
-        Number of different scenes. Sample i shows scene i modulo ``set_size``. Crops do not repeat.
+        Number of different scenes. Sample i shows scene i modulo ``set_size``. Crops never repeat.
 
     Raises
     ------
@@ -71,15 +71,15 @@ class SampleConfig:
 
 
 class Batch(NamedTuple):
-    """B samples.
+    """Images and keypoints of B samples; each sample has K rows of keypoints.
 
     Attributes
     ----------
     images : ndarray of shape (B, H, W), uint8
     keypoints : ndarray of shape (B, K, 4), float32
-        Columns: x and y, px; index of the design, -1 in rows without a keypoint; and ignore radius, px. An ignore
-        radius of 0 marks a keypoint that is to be found. Any other keypoint is to be ignored: within its ignore
-        radius the network is not trained.
+        Columns: x and y, px; index of the design, -1 in rows without a keypoint; ignore radius, px. An ignore radius
+        of 0 marks a keypoint that the detector must find. A positive ignore radius marks a keypoint that is ignored:
+        the detector head is not trained within this radius.
 
     Examples
     --------
@@ -94,12 +94,14 @@ class Batch(NamedTuple):
 
 
 def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
-    """Load the photographs of a folder in grey, in the order of their names; broken ones are left out.
+    """Load one part of the photographs of a folder in grey, in the order of their names.
+
+    Photographs are shrunk to at most 640 px. Broken and very narrow photographs are left out.
 
     Parameters
     ----------
     folder : path or None
-        None gives 64 procedural textures.
+        None: 64 procedural textures stand in for the photographs.
     part : str
         "validation" (every tenth photograph) or "training" (the others). A single photograph belongs to both.
 
@@ -163,7 +165,8 @@ def make_batch(
     count : int
         Number of samples.
     severity : float
-        Severity of the degradations, from 0 (clean) to 1 (the full range).
+        From 0 to 1. For crops: severity of the degradations; at 0, only slight blur and noise remain. For scenes:
+        share of the scenes that are degraded.
 
     Examples
     --------
@@ -182,7 +185,7 @@ def make_batch(
 
 @dataclass(frozen=True)
 class BatchJob:
-    """One batch that is to be made: its index, its number of samples, and the severity of its degradations."""
+    """A batch to be made: its index, its number of samples, and the severity of its degradations."""
 
     index: int
     count: int
@@ -197,9 +200,9 @@ def training_batches(
     jobs: Iterable[BatchJob],
     workers: int,
 ) -> Iterator[Batch]:
-    """Yield training batches in the order of their jobs, made ahead by worker processes.
+    """Yield training batches in the order of their jobs; worker processes make the batches ahead.
 
-    The worker processes are spawned, not forked: they load neither torch nor its threads.
+    The worker processes are spawned, not forked, so that they load neither torch nor its threads.
 
     Parameters
     ----------
@@ -215,7 +218,7 @@ def training_batches(
     Raises
     ------
     DataError
-        As :func:`load_photos`, or if a worker process dies.
+        If the photographs cannot be loaded, see :func:`load_photos`, or if a worker process dies.
     """
     _training_photos.cache_clear()
     return run_in_order(partial(_run_job, config, tuple(patches), folder, seed), jobs, workers)
@@ -229,7 +232,7 @@ def _run_job(
 
 @lru_cache(maxsize=1)
 def _training_photos(folder: str | Path | None) -> list[UInt8]:
-    """Load the photographs once per process."""
+    """Load the training photographs once per process."""
     return load_photos(folder, "training")
 
 

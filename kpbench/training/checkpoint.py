@@ -1,4 +1,4 @@
-"""The state of a training, and checkpoints: files that hold all that a training needs to go on to the bit."""
+"""State of a training, and checkpoints. A training resumed from a checkpoint gives the same weights, to the bit."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class TrainingState:
     ----------
     recipe : Recipe
     network : SuperPoint
-        The weights that are trained.
+        Network with the weights that are trained.
     mean : SuperPoint
-        Their running mean, which is validated and exported.
+        Network with the running mean of the weights; this network is validated and exported.
     optimizer : torch.optim.Optimizer
     step : int
-        Number of steps that are done.
+        Number of completed steps.
     seconds : float
-        Time that they took, s.
+        Time that the completed steps took, s.
 
     Examples
     --------
@@ -58,7 +58,7 @@ class TrainingState:
 
 
 def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
-    """Return the state of a training before its first step; the weights are a function of the recipe's seed.
+    """Return the state of a training before its first step; the recipe's seed determines the weights.
 
     Examples
     --------
@@ -82,7 +82,7 @@ def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
 
 
 def digest_designs(patches: Sequence[Patch]) -> str:
-    """Return the SHA-256 of designs in their order, which is the order of the channels of the ID head."""
+    """Return the SHA-256 of the designs, in the order of the channels of the ID head."""
     return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
 
 
@@ -130,7 +130,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 
 
 def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
-    """Put a checkpoint into a state from :func:`start_state`.
+    """Load a checkpoint into a state from :func:`start_state`.
 
     Raises
     ------

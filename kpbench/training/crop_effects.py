@@ -15,16 +15,19 @@ def degrade_crop(
 ) -> tuple[UInt8, float, float, float]:
     """Degrade a crop by light, rain, blur, noise and compression.
 
-    ``severity`` is from 0 to 1; ``radius``, the short semi-axis of the smallest patch, px, limits the blur.
+    ``severity`` : from 0 to 1. ``radius`` : short semi-axis of the smallest patch, px; it limits the blur.
 
     Returns
     -------
     image : ndarray of shape (H, W), uint8
-    gain, kernel, sigma : float
-        Least factor by which contrast has fallen, width of the blur in px, and standard deviation of the noise in
-        grey levels.
+    gain : float
+        Estimated ratio of the contrast after to the contrast before, where the contrast falls most.
+    kernel : float
+        Width of the blur, px; 0: no blur.
+    sigma : float
+        Estimated standard deviation of the noise, grey levels.
     """
-    gain, kernel, sigma = 1.0, 0.0, 0.6  # noise of rounding and of a good sensor
+    gain, kernel, sigma = 1.0, 0.0, 0.6  # 0.6: noise of rounding and of a good sensor
     work = image.astype(np.float32)
     if rng.random() < 0.3 * severity:
         work, factor = _draw_shadow(work, rng)
@@ -36,11 +39,11 @@ def degrade_crop(
     if rng.random() < 0.6 * severity + 0.2:
         work, kernel = _blur(work, rng, severity, radius)
     draw = rng.random()
-    if draw < 0.35 * severity:  # the darkest rung of the benchmark is 0.6^4
+    if draw < 0.35 * severity:  # the strongest dimming of the benchmark has the factor 0.6^4
         factor = 0.6 ** rng.uniform(0.0, 4.3)
         work *= np.float32(factor)
         gain *= factor
-        if rng.random() < 0.3:  # low light: noise of the photons, then of the sensor
+        if rng.random() < 0.3:  # low light: photon noise; the sensor noise follows below
             photons = rng.uniform(1.0, 8.0)
             level = np.maximum(work, 0.0) * np.float32(photons)
             work += rng.standard_normal(work.shape, dtype=np.float32) * np.sqrt(level) / np.float32(photons)
@@ -65,7 +68,7 @@ def degrade_crop(
 
 
 def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its least brightness."""
+    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its gain."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:
@@ -86,7 +89,7 @@ def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, floa
 
 
 def _draw_jagged_shadows(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw one or two shadows with five corners anywhere in and around the crop; the sides of a shadow may cross."""
+    """Draw one or two pentagonal shadows in and around the crop; the sides of a shadow may cross each other."""
     height, width = work.shape
     light, darkest = np.ones_like(work), 1.0
     for _ in range(rng.integers(1, 3)):
@@ -98,7 +101,7 @@ def _draw_jagged_shadows(work: Float32, rng: np.random.Generator) -> tuple[Float
 
 
 def _draw_rain(work: Float32, rng: np.random.Generator) -> Float32:
-    """Draw short bright streaks of one slant, a little out of focus."""
+    """Draw short, bright, parallel streaks, and blur the whole crop with a small box."""
     height, width = work.shape
     count = rng.integers(10, 60)
     start = rng.uniform(-10, 1, (count, 2)) + rng.uniform(0, 1, (count, 2)) * (width + 10, height + 10)
@@ -110,14 +113,14 @@ def _draw_rain(work: Float32, rng: np.random.Generator) -> Float32:
 
 
 def _blur(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
-    """Blur by one of four kernels; return the image and the width of the kernel, px.
+    """Blur with a box, a Gaussian, a line or a disc; return the image and the width of the blur, px.
 
-    The kernel is narrow enough that a patch of this radius, px, stays visible.
+    The width is limited, so that a patch with the short semi-axis ``radius``, px, stays visible.
     """
     widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
     width = float(rng.uniform(1.0, max(widest, 1.5)))
     kind = rng.integers(4)
-    if kind == 1:  # a Gaussian with the standard deviation of the box
+    if kind == 1:  # a Gaussian with the standard deviation of a box of this width
         return np.asarray(cv2.GaussianBlur(work, (0, 0), width / np.sqrt(12)), np.float32), width
     if kind == 2:
         kernel = line_kernel(round(1.5 * width), float(rng.integers(0, 180)))

@@ -1,7 +1,7 @@
 """Training crops: small windows with patches, boards of patches and look-alikes, made a batch at a time.
 
-One core makes several hundred crops per second. A keypoint that blur or noise has buried is marked to be ignored: the
-network is neither trained to find such a keypoint nor trained to pass over it.
+One core makes several hundred crops per second. A keypoint that blur or noise has buried is marked as ignored: the
+network learns neither to report such a keypoint nor to suppress it.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from kpbench.training.crop_effects import degrade_crop
 from kpbench.types import Float, Float32, UInt8
 
 MOST_KEYPOINTS = 12
-"""Rows of keypoints per crop; further keypoints are left out."""
+"""Rows of keypoints per sample; further keypoints of a sample are left out."""
 IMAGE_PX = (640, 480)
-"""Size of the image that a crop stands for, px: it gives the focal lengths."""
+"""Width and height of the imagined whole image, px; focal lengths are drawn relative to this width."""
 ZOOM = (0.35, 3.0)
 """Range of the scale of a background, px of the photograph per px of the crop."""
 VIEW_SCALES = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
-"""Scale at which a crop shows the image → share of the crops with this scale."""
+"""Scale of the image in a crop → share of the crops with this scale."""
 ENLARGED_RADIUS_PX = (4.0, 40.0)
-"""Range of the radii in enlarged crops, px of the image: larger patches are found at the other scales."""
+"""Range of the radii in enlarged crops, px before the enlargement; the other scales cover larger patches."""
 LEAST_SIGNAL = 12.0
-"""Least contrast · √area / noise of a keypoint that is to be found: 6 sigmas at the output of a matched filter."""
+"""Least contrast · √area / noise of a keypoint to be found. A matched filter then gives a signal of 6 sigmas."""
 LEAST_KEYPOINT_CONTRAST = 4.0
-"""Least contrast of a keypoint that is to be found, grey levels: 8-bit images hold little of a lower contrast."""
+"""Least contrast of a keypoint to be found, grey levels. Rounding to 8 bits destroys most of a weaker pattern."""
 
 
 def empty_keypoints(count: int) -> Float32:
-    """Return keypoints (count, MOST_KEYPOINTS, 4) of samples that have no keypoints."""
+    """Return the rows (count, MOST_KEYPOINTS, 4) of samples without keypoints."""
     keypoints = np.zeros((count, MOST_KEYPOINTS, 4), np.float32)
     keypoints[..., 2] = -1
     return keypoints
 
 
 class Disc(NamedTuple):
-    """A patch that is drawn into a crop: pose and inks, index of the design, centre and semi-axes in px."""
+    """A patch of a crop: its pose and inks, the index of its design, and its centre and semi-axes in px."""
 
     placement: Placement
     design: int
@@ -100,9 +100,10 @@ def make_crops(
 def cut_window(
     photo: UInt8, rng: np.random.Generator, width: int, height: int, zoom: tuple[float, float] | None = None
 ) -> UInt8:
-    """Cut a part of a photograph in a given size, and mirror it half of the time.
+    """Cut a random window out of a photograph, resize the window, and mirror it with probability 0.5.
 
-    ``zoom`` : range of px of the photograph per px of the result. None: from half of the photograph to all of it.
+    ``zoom`` : range of px of the photograph per px of the result. None: from half of the largest possible zoom to the
+    largest possible zoom.
     """
     rows, columns = photo.shape
     largest = min(columns / width, rows / height)
@@ -116,7 +117,7 @@ def cut_window(
 
 
 def _draw_background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
-    """Draw a background: mostly a part of a photograph with another contrast and brightness, sometimes an even grey."""
+    """Draw a background: a window of a photograph, half of the time with changed contrast; rarely an even grey."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
     image = cut_window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
@@ -132,7 +133,7 @@ def _contains(image: UInt8, x: float, y: float) -> bool:
 
 
 def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, limits: Limits) -> list[Disc]:
-    """Choose the patches of one crop; if they lie on a sheet of paper, draw the sheet into the image."""
+    """Return the patches of one crop; half of the time, draw a sheet of paper under the patches."""
     height, width = image.shape
     on_board = rng.random() < 0.5
     count = int(rng.choice(5, p=(0.15, 0.3, 0.22, 0.18, 0.15)))
@@ -146,7 +147,8 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
     if on_board:
         first = poses[0]
         _draw_paper(image, rng, first)
-        # a hexagon of circumradius 0.36 S for patches of diameter 0.16 S; other boards are tighter or looser
+        # a hexagon board of side S has the circumradius 0.36 S and patches of radius 0.08 S, so 4.5 radii; other
+        # boards are tighter or looser
         ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
         corners = turn + np.arange(6) * np.pi / 3
         offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array(
@@ -188,14 +190,14 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
 
 
 def _poses_at(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
-    """Draw poses as in a whole image, and move their keypoints to places (N, 2) px of the crop."""
+    """Draw poses in a whole image, and move their keypoints to the points ``at_px`` (N, 2) of the crop."""
     poses = random_poses(rng, len(at_px), *IMAGE_PX, limits)
     poses[:, :2] += (at_px - poses[:, :2, 2])[:, :, None] * poses[:, 2:]
     return poses
 
 
 def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
-    """Draw a sheet of paper in the plane of the patches: mostly lighter than the white ink, sometimes grey or dark."""
+    """Draw a sheet of paper in the plane of the patches: mostly light, sometimes of any grey level."""
     grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
     low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
     corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T
@@ -205,7 +207,7 @@ def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
 
 
 def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
-    """Draw look-alikes over the patches, and return the patches of which more than a third is hidden."""
+    """Draw look-alikes at random places, and return the patches that are hidden by more than a third."""
     before = image.copy()
     draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)
@@ -221,7 +223,7 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patc
 def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
     """Draw the patches of a whole batch with one call of the rasteriser."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
-    # edges exact to 1/64 px: faster than in a benchmark image, and far finer than the noise
+    # an edge error of 1/64 px is far below the noise; the finer edges of a benchmark image take longer
     masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
         paint_patch(image, mask, placement.black, placement.white)

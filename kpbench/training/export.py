@@ -1,4 +1,4 @@
-"""Export of a trained network as one ONNX file, for batches and images of any size (in multiples of 8 px)."""
+"""Export of a trained network as one ONNX file. Batches may have any size, images any multiple of 8 px."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from kpbench.training.network import SuperPoint
 OPSET = 17
 """Version of the ONNX operators."""
 MOST_DIFFERENCE = 1e-4
-"""Largest difference of logits between PyTorch and ONNX Runtime."""
+"""Largest allowed difference between a logit of PyTorch and the same logit of ONNX Runtime."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What :func:`export_onnx` or :func:`kpbench.training.export_int8` wrote.
+    """Facts about a file of :func:`export_onnx` or :func:`kpbench.training.export_int8`.
 
     Attributes
     ----------
     bytes : int
         Size of the file.
     step : int
-        Steps that the network was trained.
+        Number of training steps of the network.
     difference : float
-        Largest difference of the logits from those of the network before.
+        Largest difference between the logits of the file and the logits of the network that was converted.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
 
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # the newer exporter needs more packages
+        # the deprecated exporter is used, because its successor needs more packages
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             network,
@@ -93,12 +93,12 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
 
 
 def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
-    """Write the running mean of a checkpoint as an ONNX file; the file is compared with PyTorch first.
+    """Write the running mean of a checkpoint as an ONNX file, after a comparison of its outputs with PyTorch.
 
     Parameters
     ----------
     checkpoint, out : path
-        Of :func:`kpbench.training.train`, and the file to write.
+        Checkpoint of :func:`kpbench.training.train`, and the ONNX file to write.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     Raises
     ------
     DataError
-        If the checkpoint cannot be read, or the outputs differ by more than 1e-4.
+        If the checkpoint cannot be read, or ONNX Runtime and PyTorch differ by more than 1e-4 in a logit.
 
     Examples
     --------
@@ -140,6 +140,6 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
 
 
 def largest_difference(data: bytes, image: Any, expected: list[Any]) -> float:
-    """Return the largest difference between the outputs of an ONNX model and expected outputs, for one image."""
+    """Return the largest difference between the outputs of an ONNX model for an input and the expected outputs."""
     got = open_session(data)[0].run(None, {"image": image})
     return max(float(np.abs(a - b).max()) for a, b in zip(got, expected, strict=True))

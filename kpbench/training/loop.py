@@ -1,10 +1,10 @@
 """The training loop, over samples that are made on the fly.
 
 A recipe is a TOML file (:mod:`kpbench.training.recipe`). Progress is counted in samples, so a recipe means the same on
-one processor and on eight accelerators. A batch is a function of recipe and step. So a training that goes on from a
-checkpoint (:mod:`kpbench.training.checkpoint`) ends in the same weights, to the bit, as one without interruption.
+one processor and on eight accelerators. A batch is a function of recipe and step. A training resumed from a checkpoint
+(:mod:`kpbench.training.checkpoint`) therefore ends in the same weights, to the bit, as an uninterrupted training.
 
-Under ``torchrun`` with n processes, each process takes every n-th batch, and gradients are averaged.
+Under ``torchrun`` with n processes, each process takes 1/n of the samples of each step, and gradients are averaged.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class TrainOptions:
     ----------
     init : path, optional
         Weights to start from: ``superpoint`` or ``superpoint-small`` (the shipped weights), an exported ONNX file, a
-        checkpoint, or published SuperPoint weights. None: random weights. A resumed training does not use it.
+        checkpoint, or published SuperPoint weights. None: random weights. A resumed training ignores ``init``.
     resume : bool
-        Go on from the checkpoint in the folder.
+        Resume from the checkpoint in the output folder.
     minutes : float, optional
-        Stop after this time; the training can go on later.
+        Stop after this time; the training can be resumed later.
     workers : int
         Processes that make samples; 0: this process makes them.
     threads : int, optional
@@ -56,7 +56,7 @@ class TrainOptions:
     validate_every : float
         Minutes between validations.
     validation_images : int
-        Whole images per validation set.
+        Whole images per validation set of whole images; the set of crops has eight times as many crops.
     tensorboard : bool
         Write the log for TensorBoard too.
 
@@ -86,9 +86,9 @@ def train(
     options: TrainOptions = TrainOptions(),
     say: Callable[[str], None] = lambda line: None,
 ) -> bool:
-    """Train the detector's network, or go on training it.
+    """Train the detector's network, or resume a training.
 
-    Writes ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
+    Write ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def train(
     DataError
         If recipe, designs, checkpoint, folder or initial weights do not fit.
     KeyboardInterrupt
-        After a checkpoint, if a signal ended the training.
+        If a signal ended the training. The checkpoint is written before.
 
     Examples
     --------
@@ -139,7 +139,7 @@ def train(
 
 @dataclass(frozen=True)
 class _Training:
-    """A training with everything that does not change while it runs."""
+    """Everything about a training that does not change during the training."""
 
     recipe: Recipe
     folder: Path
@@ -178,7 +178,7 @@ class _Training:
         return state
 
     def run(self, state: TrainingState, signalled: Callable[[], bool]) -> None:
-        """Train until the recipe is finished, the time is over or a signal came; save, validate and log meanwhile."""
+        """Train until the recipe is finished, the time is over or a signal came; save, validate and log regularly."""
         group, options, leads = self.group, self.options, self.group.rank == 0
         validation = self.make_validation() if leads else []
         forward: nn.Module = torch.compile(state.network) if self.recipe.compile else state.network  # type: ignore[assignment]
@@ -215,7 +215,7 @@ class _Training:
                     break
 
     def make_validation(self) -> ValidationSets:
-        """Return the validation sets, made over photographs that the training does not use."""
+        """Return the validation sets; their backgrounds are photographs that the training does not use."""
         photos = load_photos(self.backgrounds, "validation")
         return make_validation_sets(self.recipe, self.designs, photos, self.options.validation_images)
 
@@ -232,7 +232,7 @@ class _Training:
 
 @contextmanager
 def _signals_seen() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM, so that the current step is finished; yield a function that tells whether one came."""
+    """Catch Ctrl-C and SIGTERM, so that the current step ends; yield a function that tells whether a signal came."""
     seen = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield seen.is_set

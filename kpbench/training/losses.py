@@ -1,4 +1,4 @@
-"""Targets of the network, and the losses of its outputs against them."""
+"""Targets of the network, and the losses of its outputs against the targets."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ class Targets:
     Attributes
     ----------
     place : Tensor of shape (B, 65, h, w)
-        Probability of each pixel of the cell, and of "no keypoint"; their sum is 1.
+        Probability of each pixel of the cell, and of "no keypoint"; the 65 probabilities have the sum 1.
     valid : Tensor of shape (B, h, w)
         1 where the detector head is trained, 0 near ignored keypoints.
     identity : Tensor of shape (B, h, w), int64
         Index of the design, or ``ids`` for "no patch".
     near, far : Tensor of shape (B, h, w), bool
-        Cells within 8 px of a keypoint, and cells further than 16 px from all keypoints.
+        Whether the centre of the cell lies within 8 px of a keypoint, and whether it lies further than 16 px from all
+        keypoints. Ignored keypoints do not count, but cells near ignored keypoints are not ``far``.
     """
 
     place: Tensor
@@ -102,7 +103,7 @@ def compute_losses(detector: Tensor, identity: Tensor, targets: Targets, config:
 
 
 def _cross_entropy(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
-    """Return the cross-entropy near keypoints plus that far from all keypoints."""
+    """Return the mean cross-entropy near keypoints plus the mean cross-entropy far from all keypoints."""
     entropy = F.cross_entropy(identity, targets.identity, reduction="none")
     near, far = targets.near, targets.far
     return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
@@ -112,7 +113,7 @@ def _hinge(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
     """Return SuperPoint's descriptor loss (eq. 4 to 6 of its paper) of an image against a map of one-hot vectors.
 
     The sum over pairs of cells is grouped by the class of the second cell: the dot product with a one-hot vector is
-    one channel of the normalised descriptor. The class of a cell is the design whose keypoint lies in it.
+    one channel of the normalised descriptor. The class of a cell is the design of its keypoint, or "no patch".
     """
     has_keypoint = targets.place[:, -1] < 1
     classes = torch.where(has_keypoint, targets.identity, identity.shape[1] - 1)

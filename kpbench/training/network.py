@@ -1,4 +1,4 @@
-"""The network: SuperPoint with an attached layer on each head (paper §2.2); its sizes are data.
+"""The network: SuperPoint with an attached layer on each head (paper §2.2); the recipe sets the sizes.
 
 A VGG encoder reduces the image to cells of 8x8 px. The detector head gives 65 logits per cell: one per pixel of the
 cell, row by row, and one for "no keypoint". The descriptor head ends in an attached layer with one logit per design
@@ -22,7 +22,7 @@ from kpbench.detectors.superpoint import CELL_PX
 from kpbench.training.recipe import NetworkConfig
 
 HALVINGS = 3
-"""Stages of the encoder that halve the image: a cell is ``2**HALVINGS`` px wide."""
+"""Number of stages of the encoder that halve the image; a cell is ``2**HALVINGS`` px wide."""
 NO_KEYPOINT_PRIOR = 0.98
 """Probability of "no keypoint" and of "no patch" that an untrained network gives."""
 
@@ -81,14 +81,14 @@ class SuperPoint(nn.Module):
         return nn.Sequential(conv_block(c_in, width, 3, norm), conv_block(width, c_out, 1, norm, relu=False))
 
     def _initialise(self) -> None:
-        """Set Kaiming weights, and biases at the prior; without it, training from scratch does not start."""
+        """Set Kaiming weights, and set biases to the prior. Training from scratch does not start without the prior."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(cast(Tensor, module.bias))
         pixels, ids = CELL_PX * CELL_PX, self.config.ids
         with torch.no_grad():
-            # the attached layer starts as the identity
+            # the attached layer of the detector head starts as the identity
             self.detector_attached.weight.copy_(torch.eye(pixels + 1)[:, :, None, None])
             cast(Tensor, self.detector_attached.bias)[-1] = math.log(
                 NO_KEYPOINT_PRIOR / (1 - NO_KEYPOINT_PRIOR) * pixels
@@ -100,7 +100,7 @@ class SuperPoint(nn.Module):
 
     @property
     def attached(self) -> list[nn.Parameter]:
-        """Parameters of the two attached layers, which the paper trains alone at first."""
+        """Parameters of the two attached layers. The paper at first trains only these layers."""
         return [*self.detector_attached.parameters(), *self.descriptor_attached.parameters()]
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The processes that train one network together: one process, or those that ``torchrun`` started."""
+"""The processes that train one network together: a single process, or all processes of ``torchrun``."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class ProcessGroup:
         return bool(total.item())
 
     def average_gradients(self, network: nn.Module) -> None:
-        """Replace the gradients in every process by their mean, in one message."""
+        """Replace each gradient by its mean over all processes; send all gradients in one message."""
         if self.size == 1:
             return
         gradients = [p.grad for p in network.parameters() if p.grad is not None]
@@ -49,7 +49,7 @@ class ProcessGroup:
 
 
 def join_process_group() -> ProcessGroup:
-    """Return this process among those of ``torchrun``, which sets environment variables; else a single process."""
+    """Return this process as a member of its group. ``torchrun`` describes the group in environment variables."""
     rank, size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     cuda = torch.cuda.is_available()
     device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")

@@ -25,18 +25,18 @@ from kpbench.training.export import Exported, largest_difference
 def export_int8(model: str | Path, out: str | Path) -> Exported:
     """Write an exported network again in 8-bit integers: a quarter of the size, three times as fast on a processor.
 
-    The ranges of the activations come from 40 synthetic scenes over procedural backgrounds, half of them deteriorated,
-    at the scales of the image that the detector uses.
+    The ranges of the activations are measured on 40 synthetic scenes over procedural backgrounds, at the detector's
+    image scales. About half of the scenes are degraded.
 
     Parameters
     ----------
     model, out : path
-        ONNX file of :func:`kpbench.training.export_onnx`, and the file to write.
+        ONNX file of :func:`kpbench.training.export_onnx`, and the ONNX file to write.
 
     Returns
     -------
     Exported
-        ``difference`` is the largest difference of the logits from those of the float32 network, on a noise image.
+        ``difference`` is the largest difference from the logits of the float32 network, on an image of noise.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
         data = Path(model).read_bytes()
         given = onnx.load_from_string(data)
         content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
-    except Exception as error:  # some errors are of classes of protobuf that are not public
+    except Exception as error:  # protobuf raises errors of private classes
         why = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{model}: cannot be read as an ONNX file of kpbench export-model ({why})") from None
     if content.get("schema") != SCHEMA or "int8" in content:
@@ -78,13 +78,13 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
 def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any:
     """Return an ONNX model with its convolutions in 8-bit integers.
 
-    Weights keep 7 bits: with 8, the sums of products would saturate on processors without VNNI and differ there.
+    Weights have 7 bits. With 8 bits, sums of products would saturate on processors without VNNI.
 
     Parameters
     ----------
     model : onnx.ModelProto
     feeds : iterable of dict
-        Inputs of the network; they give the ranges of the activations.
+        Inputs of the network on which the ranges of the activations are measured.
     """
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
@@ -98,7 +98,7 @@ def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "int8.onnx"
-        logging.disable(logging.WARNING)  # hints about preprocessing, which convolutions do not need
+        logging.disable(logging.WARNING)  # silences hints at a preprocessing that convolutions do not need
         try:
             quantize_static(
                 model,

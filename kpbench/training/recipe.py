@@ -28,10 +28,10 @@ class NetworkConfig:
         How each of the first three stages halves the image: "max" (max-pooling after the stage) or "stride" (the
         last convolution of the stage has stride 2).
     head_width, descriptor_width : int
-        Channels of the hidden layer of each head, and of the descriptor.
+        Channels of the hidden layer of each head, and channels of the descriptor.
     norm : str
-        Position of BatchNorm: "before" the activation (then it is folded into the convolution at export) or "after"
-        it (as in the published SuperPoint weights).
+        Position of BatchNorm: "before" the activation (the export folds BatchNorm into the convolution) or "after"
+        the activation (as in the published SuperPoint weights).
     ids : int
         Number of designs that the ID head tells apart, besides "no patch".
 
@@ -68,18 +68,19 @@ class LossConfig:
     Attributes
     ----------
     place : str
-        Target of the detector head: "pixel" (the pixel nearest to the keypoint, as SuperPoint) or "split" (the four
-        pixels around it, by distance and across cell borders, so that the mean of the target is the keypoint).
+        Target of the detector head: "pixel" (the pixel nearest to the keypoint, as in SuperPoint) or "split" (the four
+        pixels around the keypoint, with bilinear weights, also across cell borders).
     positive_weight : float
-        Weight of a cell with a keypoint, relative to a cell without.
+        Weight of a cell with a keypoint, relative to a cell without a keypoint.
     focal : float
-        Exponent of the focal loss on "is there a keypoint in this cell" (Lin et al., *Focal loss for dense object
-        detection*, ICCV 2017); 0: none.
+        Exponent of the focal factor, by which the detector loss of well-predicted cells weighs less (Lin et al., *Focal
+        loss for dense object detection*, ICCV 2017); 0: no focal factor.
     identity : str
-        "entropy": cross-entropy over designs and "no patch", at cells within 8 px of a keypoint and beyond 16 px of
-        all. "hinge": SuperPoint's descriptor loss against the one-hot map of all cells; cells of one class are not
-        negatives of each other.
+        "entropy": cross-entropy over designs and "no patch", at cells within 8 px of a keypoint and at cells more than
+        16 px from all keypoints. "hinge": SuperPoint's descriptor loss against the one-hot map of all cells; cells of
+        one class are not negatives of each other.
     identity_weight : float
+        Weight of the identity loss.
     lambda_d, positive_margin, negative_margin : float
         Parameters of the hinge loss (the paper's Table 1).
 
@@ -108,9 +109,10 @@ class Phase:
     ----------
     samples : int
     trains : str
-        Weights that are trained: "all", or "attached" (only the attached layers).
+        Layers that are trained: "all", or "attached" (only the attached layers).
     severity : (float, float)
-        Severity of the degradations at the first and at the last sample of the phase: 0 is clean, 1 is the full range.
+        Severity of the degradations at the first and at the last sample of the phase, from 0 to 1; see
+        :func:`kpbench.training.make_batch`.
 
     Examples
     --------
@@ -126,7 +128,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A training recipe: all that decides a training, except photographs, designs and initial weights.
+    """A training recipe: it determines a training, together with photographs, designs and initial weights.
 
     Attributes
     ----------
@@ -141,17 +143,17 @@ class Recipe:
     optimizer : str
         "adam" (weight decay as L2, as in the paper) or "adamw".
     lr, weight_decay : float
-        ``lr`` is the learning rate.
+        Learning rate and weight decay.
     warmup : int
         Samples over which the learning rate rises from 0.
     schedule : str
-        "step" (the learning rate is multiplied by ``decay`` at each of ``decay_at``) or "cosine" (it falls to
-        ``decay`` times its value at the end).
+        "step" (the learning rate is multiplied by ``decay`` at each entry of ``decay_at``) or "cosine" (the learning
+        rate falls from ``lr`` to ``decay`` · ``lr``, along half a cosine).
     decay : float
     decay_at : tuple of int
-        Samples.
+        Positions in the training, samples.
     ema : float
-        Decay per step of the running mean of the weights; the mean is validated and exported.
+        Decay per step of the running mean of the weights; the running mean is validated and exported.
     precision : str
         "fp32", or "bf16" (autocast): twice as fast on a GPU or a processor with AMX or AVX512-BF16, far slower on
         other processors.
@@ -225,7 +227,7 @@ class Recipe:
 
 
 T = TypeVar("T")
-CHOICES = {  # values of the keys that have a few possible values
+CHOICES = {  # key → its allowed values
     "place": ("pixel", "split"),
     "identity": ("entropy", "hinge"),
     "trains": ("all", "attached"),
@@ -237,17 +239,17 @@ CHOICES = {  # values of the keys that have a few possible values
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return the files of the recipes that ship with kpbench, by name."""
+    """Return the files of the recipes that ship with kpbench, by the recipes' names."""
     return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.toml"))}
 
 
 def load_recipe(name: str | Path) -> Recipe:
-    """Read a training recipe: one that ships with kpbench by its name, or a TOML file.
+    """Read a training recipe, given the name of a shipped recipe or the path of a TOML file.
 
     Raises
     ------
     DataError
-        If there is no such recipe, the file cannot be read or is no TOML, or it has an unknown key or a wrong value.
+        If there is no such recipe, or if the file cannot be read, is no TOML, has an unknown key or a wrong value.
 
     Examples
     --------

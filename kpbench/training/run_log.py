@@ -17,12 +17,12 @@ from tqdm import tqdm
 from kpbench.training.checkpoint import TrainingState
 
 Record = Callable[[TrainingState, Mapping[str, Any]], None]
-"""A function that writes figures at the current step."""
+"""A function that logs figures at the current step."""
 
 
 @contextmanager
 def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
-    """Append figures to ``log.jsonl`` and, if ``tensorboard``, to TensorBoard's files; yield the function to call."""
+    """Open ``log.jsonl`` and, if ``tensorboard``, TensorBoard's files; yield a function that appends figures."""
     if not active:
         yield lambda state, figures: None
         return
@@ -52,7 +52,7 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
 
 @contextmanager
 def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
-    """Show a progress bar over samples, only on a terminal; yield a function of the step and of a text."""
+    """Show a progress bar over samples, only on a terminal; yield a function that sets the step and a text."""
     batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
     hidden = not active or not sys.stderr.isatty()
     with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
@@ -65,7 +65,7 @@ def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, st
 
 
 class LossMeter:
-    """Mean losses since the last reading, and samples per second since the training began."""
+    """Mean losses since the last reading, and samples per second since the training began or was resumed."""
 
     def __init__(self, state: TrainingState, device: torch.device, began: float) -> None:
         self._began, self._first = began, state.step
@@ -76,7 +76,7 @@ class LossMeter:
         self._sums += torch.stack(losses)
 
     def read(self, state: TrainingState) -> dict[str, float]:
-        """Return the figures for the log, and begin new means."""
+        """Return the figures for the log, and start new means."""
         detector_loss, identity_loss = (self._sums / (state.step - self._since)).tolist()
         samples = (state.step - self._first) * state.recipe.batch
         self._sums.zero_()
@@ -90,7 +90,7 @@ class LossMeter:
 
 
 class Timer:
-    """Tells whether a time has passed since the timer was made or restarted."""
+    """A timer that tells whether a time has passed since the timer was made or restarted."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._since = seconds, time.monotonic()
@@ -100,5 +100,5 @@ class Timer:
         return time.monotonic() - self._since > self._seconds
 
     def restart(self) -> None:
-        """Begin anew."""
+        """Restart the timer."""
         self._since = time.monotonic()

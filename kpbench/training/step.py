@@ -21,12 +21,12 @@ def train_step(
     state : TrainingState
         Changed in place.
     forward : nn.Module
-        The network, or the network as ``torch.compile`` made it.
+        The network of the state, compiled by ``torch.compile`` or not.
     images : Tensor of shape (B, H, W), uint8
     keypoints : Tensor of shape (B, K, 4)
         See :class:`kpbench.training.Batch`.
     group : ProcessGroup, optional
-        Processes that train together. None: this process alone.
+        Group of processes that train together. None: this process trains alone.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def train_step(
     network.requires_grad_(phase.trains == "all")
     for parameter in network.attached:
         parameter.requires_grad_(True)
-    network.train(phase.trains == "all")  # a frozen encoder keeps its BatchNorm statistics too
+    network.train(phase.trains == "all")  # frozen layers also keep their BatchNorm statistics
     for param_group in state.optimizer.param_groups:
         param_group["lr"] = recipe.rate(state.step)
 

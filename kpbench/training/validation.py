@@ -16,10 +16,10 @@ from kpbench.training.recipe import Recipe
 from kpbench.types import UInt8
 
 FOUND_PX, CLOSE_PX = 3.0, 1.0
-"""Largest distance of a detection from a keypoint that counts as found, and as found exactly, px."""
+"""Largest distance from a keypoint to a detection at which the keypoint counts as found, and as found closely, px."""
 
 ValidationSets = list[tuple[str, Batch]]
-"""Names and samples."""
+"""Name and samples of each validation set."""
 
 
 def make_validation_sets(
@@ -30,8 +30,8 @@ def make_validation_sets(
     Returns
     -------
     list of (str, Batch)
-        "clean": ``count`` whole images without deteriorations; "paper": the same with the paper's deteriorations;
-        "hard": crops at full severity.
+        "clean": ``count`` whole images without deteriorations. "paper": the same images with the paper's
+        deteriorations. "hard": 8 · ``count`` crops at full severity.
     """
     scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
     crops = replace(recipe.samples, kind="crops", size=(128, 128))
@@ -47,15 +47,15 @@ def make_validation_sets(
 def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, float]:
     """Measure what a network finds, at the default threshold and without verification.
 
-    :func:`kpbench.score` cannot take its place. The ε of ``score`` is relative to the radius, which crops do not keep.
-    And crops have keypoints to be ignored: a detection near such a keypoint is no false alarm.
+    :func:`kpbench.score` cannot score crops, for two reasons. Its ε is relative to the radius, which crops do not hold.
+    Crops also have ignored keypoints: a detection near an ignored keypoint is no false alarm.
 
     Returns
     -------
     dict
         For each set NAME: ``NAME_found_3px`` and ``NAME_found_1px``, the shares of keypoints with a detection within
         3 px and 1 px; ``NAME_id``, the share of right identities among the keypoints found within 3 px;
-        ``NAME_alarms``, the number of detections per image that no keypoint explains.
+        ``NAME_alarms``, the number of false alarms per image.
     """
     network.eval()
     device = next(network.parameters()).device

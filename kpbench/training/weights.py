@@ -1,4 +1,4 @@
-"""Initial weights: published ones, exported ones, those of a checkpoint, and those of a smaller network."""
+"""Initial weights: from a published file, an exported file or a checkpoint, also of a smaller network."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
 
 BATCHNORM_PX = 128 * 96 * 96
-"""Number of px of the samples whose statistics initialise BatchNorm; the samples are at least 2 and at most 128."""
+"""Total number of px of the samples on which BatchNorm is initialised; 2 to 128 samples are used."""
 
 
 def load_initial_weights(
@@ -32,7 +32,7 @@ def load_initial_weights(
     backgrounds: str | Path | None,
     device: torch.device,
 ) -> str:
-    """Put initial weights into a fresh training; if their network has other sizes, the new network grows from it.
+    """Load initial weights into a fresh training. A network of other sizes grows from the network of the weights.
 
     Parameters
     ----------
@@ -82,15 +82,15 @@ def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[di
     ----------
     name : str or Path
         ``superpoint`` or ``superpoint-small`` (the shipped weights), an ONNX file of ``kpbench export-model``, a
-        checkpoint (of which the running mean is taken), or published SuperPoint weights.
+        checkpoint (its running mean is read), or published SuperPoint weights.
     patches : sequence of Patch
-        Designs of the training. An ID head for other designs is left out.
+        Designs of the training. The attached layer of the ID head is left out if it was trained on other designs.
 
     Returns
     -------
     weights : dict of str to Tensor
     sizes : NetworkConfig or None
-        Sizes of their network, where the file tells them.
+        Sizes of the network of the weights; None if the file does not hold its sizes.
     """
     shipped = WEIGHTS / f"{name}.onnx"
     path = shipped if shipped.is_file() and not Path(name).is_file() else Path(name)
@@ -108,7 +108,7 @@ def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[di
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """Read a state-dict from a safetensors file or a pickle; of a pickle, nothing but tensors is unpickled.
+    """Read a state-dict from a safetensors file or a pickle. Only tensors are unpickled.
 
     Raises
     ------
@@ -139,7 +139,7 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         model = onnx.load(path)
         content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
-    except Exception as error:  # some errors are of classes of protobuf that are not public
+    except Exception as error:  # protobuf raises errors of private classes
         why = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
     if "int8" in content:
@@ -150,14 +150,14 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 
 def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source: str) -> str:
-    """Put a state-dict into a network. It may lack the attached layers, which then keep their random weights.
+    """Load a state-dict into a network. Attached layers that the state-dict lacks keep their random weights.
 
     Parameters
     ----------
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
-        A state-dict without any BatchNorm is complete, see :func:`restore_batchnorm`.
+        The state-dict. It may lack all BatchNorms, see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
@@ -169,11 +169,12 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     Raises
     ------
     DataError
-        If a tensor has no place in the network or another shape, or a layer other than the attached layers gets none.
+        If a tensor has no place in the network or a wrong shape, or if a tensor of any but the attached layers is
+        missing.
     """
     own = network.state_dict()
     bare = is_folded(weights)
-    # the number of batches that BatchNorm has seen is no weight, and some files lack it
+    # BatchNorm's counter of batches is no weight, and some files lack the counter
     ours = {name for name in own if not (name.endswith("num_batches_tracked") or (bare and ".bn." in name))}
     needed = {name for name in ours if "_attached" not in name}
     given = {name for name in weights if not name.endswith("num_batches_tracked")}
@@ -191,15 +192,15 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
 
 
 def is_folded(weights: Mapping[str, Tensor]) -> bool:
-    """Return whether a state-dict has no BatchNorm, as that of an exported file."""
+    """Return whether a state-dict has no BatchNorm. Exported files have none, because it is folded."""
     return not any(".bn." in name for name in weights)
 
 
 def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
-    """Make each BatchNorm the identity, by its statistics on some inputs of the network.
+    """Make each BatchNorm the identity on some inputs: its weight and bias cancel its statistics.
 
-    This is the reverse of folding: afterwards the network computes what its convolutions alone compute, and it can be
-    trained. ``layers`` : the BatchNorms that are changed; None: all.
+    This is the reverse of folding: the network then computes what its convolutions alone compute, and can be trained.
+    ``layers`` : the BatchNorms that are changed; None: all.
     """
 
     def become_identity(module: nn.Module, given: tuple[Tensor]) -> None:
@@ -222,12 +223,13 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
 
 @torch.no_grad()
 def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
-    """Start a network from a trained one that is narrower or of another depth (Chen et al., *Net2Net*, ICLR 2016).
+    """Start a network from a trained network of less width or another depth (Chen et al., *Net2Net*, ICLR 2016).
 
     The channels of the smaller network fill the first channels. The other channels keep their random weights; the
-    weights from them to trained channels are 0. In each stage, convolutions that the smaller network lacks become the
-    identity, and surplus convolutions of the smaller network are left out. The network then computes what the smaller
-    network computes, unless convolutions are left out or the two networks halve the image in different ways.
+    weights from these other channels to trained channels are 0. In each stage, convolutions that the smaller network
+    lacks become the identity, and surplus convolutions of the smaller network are left out. The network then computes
+    what the smaller network computes, unless convolutions are left out or the two networks halve the image in different
+    ways.
 
     Parameters
     ----------
@@ -236,7 +238,7 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     smaller : SuperPoint
         With BatchNorm, see :func:`restore_batchnorm`.
     images : Tensor of shape (B, 1, H, W)
-        Images in [0, 1]; they give the statistics of the BatchNorms after convolutions that become the identity.
+        Images in [0, 1]. Each added convolution is the identity; its BatchNorm becomes the identity on these images.
     source : str
         Name of the smaller network, for messages.
 
@@ -248,9 +250,10 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     Raises
     ------
     DataError
-        If the smaller network is wider somewhere, or BatchNorm stands after the activation in one of the networks.
-        Then no convolution can become the identity, as the activation cuts off negative values.
+        If a layer of the smaller network is wider than the same layer of the network, or if BatchNorm stands after the
+        activation in one of the networks.
     """
+    # a BatchNorm after the activation forbids added convolutions: the activation cuts off negative values
     if "after" in (smaller.config.norm, network.config.norm):
         raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")
     identities: list[nn.Module] = []
@@ -279,7 +282,7 @@ def _blocks(stage: nn.Module) -> list[nn.Module]:
 
 
 def _copy_channels(layer: nn.Module, given: nn.Module, inputs: int, place: str) -> int:
-    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return their number.
+    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return the number of channels.
 
     ``inputs`` : number of input channels that are trained. ``place`` : name of the layer, for messages.
     """

@@ -1,4 +1,4 @@
-"""Images of datasets, handed to worker processes one by one."""
+"""References to images of datasets; worker processes take the references and read the images."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class ImageRef:
-    """An image of a dataset, by its position; it is read where it is needed.
+    """Reference to an image of a dataset. The process that needs the image reads the image.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class ImageRef:
     fingerprint : str
         Fingerprint of the dataset.
     index : int
-        Position of the image.
+        Position of the image in the dataset.
     """
 
     folder: Path
@@ -53,12 +53,12 @@ class ImageRef:
 
 @cache
 def _open_dataset(folder: Path, fingerprint: str) -> Dataset:
-    """Open a dataset once per process. The fingerprint is part of the key: the dataset in a folder may be replaced."""
+    """Open a dataset once per process. Another fingerprint shows that the dataset in the folder was replaced."""
     return open_dataset(folder)
 
 
 def image_refs(dataset: Dataset) -> list[ImageRef]:
-    """Return the images of a dataset."""
+    """Return references to all images of a dataset."""
     return [ImageRef(dataset.path, dataset.fingerprint, n) for n in range(len(dataset))]
 
 
@@ -70,12 +70,12 @@ def map_images(
     Parameters
     ----------
     work : callable
-        Can be pickled.
+        Must be picklable.
     dataset : Dataset
     given : iterable
         The argument of each image.
     workers : int
-        Processes; 0: none but this one.
+        Number of worker processes; 0: this process does the work.
     label : str
         Text before the progress bar.
     """
@@ -94,6 +94,6 @@ def _apply(work: Callable[[ImageRef, Given], Result], job: tuple[ImageRef, Given
 
 @contextmanager
 def progress_bar(label: str, total: int) -> Iterator[Any]:
-    """Show a progress bar on stderr; only on a terminal."""
+    """Show a progress bar on stderr if stderr is a terminal."""
     with tqdm(total=total, desc=label, leave=False, disable=not sys.stderr.isatty()) as bar:
         yield bar

@@ -3,8 +3,9 @@
 The ellipse network sees the surroundings of a place in four octaves. It gives the log odds that the place lies on a
 patch, the centre of the patch, and the ellipse that the patch fills; the design of the patch plays no part. The network
 is trained on places that the detector's network finds, and on places around every keypoint. Most of these places are
-rotated and scaled, and all are mirrored, at random. In a dataset of designs that the detector's network does not know,
-only the places around keypoints are used. At the end the log odds are scaled so that they hold for a test dataset.
+rotated and scaled at random; batches of places are mirrored at random. In an image with designs that the detector's
+network does not know, only the places around keypoints are used. Finally, the log odds are calibrated on a test
+dataset.
 """
 
 from __future__ import annotations
@@ -51,15 +52,15 @@ MADE_PLACES, MADE_DEVIATION = 3, 0.22
 ROTATED_SHARE, OCTAVES_OF_SCALE = 0.7, 0.35
 """Share of training places that are shown rotated and scaled, and the range of the scale, ± octaves."""
 USUAL_LOG_RADIUS = 2.5
-"""Log of a usual radius, px; an untrained network predicts about this radius."""
+"""Natural logarithm of a usual radius in px; an untrained network predicts about this radius."""
 RADII_PX = ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000))
 """Ranges of the short semi-axis in the report, px."""
 LOG_ODDS = (-8, -7, -6, -5, -4, -2, 0)
-"""Limits of the log odds in the report."""
+"""Thresholds of the log odds in the report."""
 
 
 class EllipseNetwork(nn.Module):
-    """Surroundings of places to log odds and ellipses."""
+    """Network that takes the surroundings of places, and returns log odds and ellipses."""
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
@@ -73,8 +74,8 @@ class EllipseNetwork(nn.Module):
     def forward(self, surroundings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log odds (n,), shift (n, 2) and log map (n, 2, 2).
 
-        ``surroundings`` : (n, OCTAVES, VIEW_PX, VIEW_PX), grey levels. Shift and log map are those of
-        :func:`kpbench.detectors.verification.move_poses`.
+        ``surroundings`` : (n, OCTAVES, VIEW_PX, VIEW_PX), grey levels.
+        :func:`kpbench.detectors.verification.move_poses` applies the shift and the log map.
         """
         centred = surroundings - surroundings.mean((2, 3), keepdim=True)
         out = self.body(centred / (centred.square().mean((2, 3), keepdim=True).sqrt() + 2.0))
@@ -133,9 +134,9 @@ def train_ellipse(
     epochs, batch : int
         Passes over all places, and places per step.
     from_shipped : bool
-        Start from the shipped weights. With ``epochs=0`` the report is about the shipped weights.
+        Start from the shipped weights. With ``epochs=0``, the report describes the shipped weights.
     workers : int
-        Processes that collect places; 0: none but this one.
+        Number of worker processes that collect places; 0: this process collects the places.
     threads : int, optional
         Threads of PyTorch.
     say : callable
@@ -179,8 +180,10 @@ def _detector() -> SmallSuperPointDetector:
 def collect_places(image: ImageRef, train: bool) -> Places:
     """Return the places of one image.
 
+    Places between the limits of ``ON_PATCH`` and ``OFF_PATCH`` are left out.
+
     ``train`` : True adds places around the keypoints, leaves out most places on no patch, and rotates and scales most
-    places. False returns the places as the detector finds them.
+    places. False returns the other places unchanged.
     """
     grey, keypoints = image.read()
     rng = image.rng()
@@ -250,7 +253,7 @@ def _train(places: PlaceTensors, epochs: int, batch: int, from_shipped: bool) ->
 
 
 def calibrate_log_odds(network: EllipseNetwork, places: PlaceTensors) -> None:
-    """Scale and shift the network's log odds to the most probable ones (Platt, *Probabilistic outputs*, 1999)."""
+    """Scale and shift the network's log odds by maximum likelihood on places (Platt, *Probabilistic outputs*, 1999)."""
     with torch.inference_mode():
         odds = torch.cat([network(part.float())[0] for part in torch.split(places.surroundings, 1024)])
     odds, on = odds.clone(), places.on_patch.float()
@@ -286,11 +289,11 @@ def _mirror(places: PlaceTensors) -> PlaceTensors:
 
 @torch.inference_mode()
 def _report(network: EllipseNetwork, places: PlaceTensors, images: int, say: Say) -> None:
-    """Report how near the ellipses are to the truth, and how many places each limit of the log odds keeps.
+    """Report how near the ellipses are to the truth, and how many places each threshold of the log odds keeps.
 
-    Each range of the short semi-axis has a line: the shares of centres within 0.1 and 0.2 long semi-axes of the truth,
-    for the place itself and for the predicted centre; and the shares of ellipses with semi-axes right to a tenth and to
-    a fifth.
+    Each range of the short semi-axis has a line. The line gives the shares of places within 0.1 and 0.2 long semi-axes
+    of the true centre, the same shares of predicted centres, and the shares of ellipses whose semi-axes are right to a
+    tenth and to a fifth.
     """
     surroundings, on, shift, log_map = places
     out = [network(part.float()) for part in torch.split(surroundings, 1024)]

@@ -18,9 +18,9 @@ from kpbench.types import Float
 
 
 class Judge(nn.Module):
-    """Views and evidence of hypotheses to log odds and corrections of the pose.
+    """Network that takes views and evidence of hypotheses, and returns log odds and corrections of the pose.
 
-    ``evidence`` : some evidence (n, columns); its mean and deviation standardise each column.
+    ``evidence`` : training samples (n, columns); their mean and deviation standardise each column.
     """
 
     mean: Tensor
@@ -40,10 +40,10 @@ class Judge(nn.Module):
     def forward(self, view: Tensor, evidence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return log odds (n,), shift (n, 2) and log map (n, 2, 2).
 
-        ``view`` (n, 2, VIEW_PX, VIEW_PX) and ``evidence`` (n, columns) are those of
-        :func:`kpbench.detectors.hypotheses.judge_inputs`.
+        :func:`kpbench.detectors.hypotheses.judge_inputs` makes the inputs ``view`` (n, 2, VIEW_PX, VIEW_PX) and
+        ``evidence`` (n, columns).
         """
-        # evidence outside the range of the training counts no more than its limit
+        # clipped, so that evidence unlike the training samples has a limited effect
         standard = ((evidence - self.mean) / self.deviation).clamp(-4, 4)
         if self.training:
             standard = standard + 0.05 * torch.randn_like(standard)
@@ -61,7 +61,7 @@ def input_tensors(hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Ten
 
 @torch.inference_mode()
 def apply_judge(network: Judge, hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Float, Hypotheses]:
-    """Return what :func:`kpbench.detectors.verification.judge` returns, by a judge in PyTorch."""
+    """Judge hypotheses with a network in PyTorch, as :func:`kpbench.detectors.verification.judge` does in ONNX."""
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     odds, shift, log_map = (part.numpy() for part in network(*input_tensors(hypotheses, patches)))

@@ -1,4 +1,4 @@
-"""Report on judges: detection scores of a test dataset at several rates of false alarms."""
+"""Report on the judges: detection scores on a test dataset at several rates of false alarms."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kpbench.types import Float
 FALSE_ALARM_RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
 """False alarms per image."""
 REPORTED_SCORES = (0.3, 0.5)
-"""Thresholds of the score, a probability."""
+"""Thresholds of the score; the score is a probability."""
 
 
 def report_judges(
@@ -54,7 +54,7 @@ def report_judges(
 
 
 def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]]], truths: int, say: Say) -> None:
-    """Report the detection scores of detections, given as (log odds, whether right) per image."""
+    """Report the detection scores of detections; each image gives log odds and whether each detection is right."""
     parts = list(of_images)
     log_odds, right = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(-log_odds, kind="stable")
@@ -72,7 +72,7 @@ def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]
 def _count_explained(
     hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch], tolerance: float
 ) -> int:
-    """Return the number of keypoints that have a right hypothesis."""
+    """Return the number of keypoints for which at least one hypothesis is right."""
     ids = design_ids(hypotheses, patches)
     explained = [mark_correct(hypotheses.xy, ids, keypoints[k : k + 1], tolerance) for k in range(len(keypoints))]
     return sum(bool(right.any()) for right in explained)
@@ -81,7 +81,7 @@ def _count_explained(
 def _select_reported(
     log_odds: Float, hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the hypotheses that a detector would report without a threshold: log odds, and whether each is right."""
+    """Return log odds and rightness of the hypotheses that a detector without a threshold would report."""
     best = select_likeliest(hypotheses.place, log_odds)
     hypotheses, log_odds = hypotheses[best], log_odds[best]
     reach = np.maximum(Decoding.separation_px, DISC_SHARE * short_semi_axis(hypotheses.A))

@@ -1,4 +1,4 @@
-"""Hypotheses of synthetic images, which the judges are trained on."""
+"""Hypotheses of synthetic images; the judges are trained on these hypotheses."""
 
 from __future__ import annotations
 
@@ -31,27 +31,27 @@ from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 from kpbench.types import Float, UInt8
 
 TRAINING_MARGIN = 1.0
-"""In training, the log odds from which hypotheses are shown again and fitted are lower by this."""
+"""Training lowers the thresholds of the log odds for the second look and for the fit by this amount."""
 SPECKLED_EVERY = 3
-"""One in so many training images has specks."""
+"""One training image in this many has specks."""
 
 
 @dataclass(frozen=True)
 class ImageLooks:
-    """What is known of one image before the fit.
+    """Keypoints, candidates and hypotheses of one image before the fit.
 
     Attributes
     ----------
     keypoints : structured ndarray
-        The truth.
+        The true keypoints.
     candidate_score : ndarray of shape (n,)
-        Score of each candidate of the network.
+        Score of each candidate of the detector's network.
     candidate_right : ndarray of shape (n,), bool
+        Whether each candidate is right.
     first_look, second_look : Hypotheses
-        Hypotheses of the first look, and hypotheses of the second look in the poses that the shipped first judge
-        corrected.
+        Hypotheses as proposed, and hypotheses in the poses that the shipped first judge corrected at the first look.
     shipped_log_odds : ndarray
-        Log odds of both looks, one after the other, by the shipped first judge.
+        Log odds by the shipped first judge: first of ``first_look``, then of ``second_look``.
     """
 
     keypoints: NDArray[Any]
@@ -64,16 +64,16 @@ class ImageLooks:
 
 @dataclass(frozen=True)
 class ImageFits:
-    """What is known of one image after the fit.
+    """The n hypotheses of one image that are fitted.
 
     Attributes
     ----------
     log_odds : ndarray of shape (n,)
-        Log odds by the new first judge at its second look.
+        Log odds by the new first judge at the second look.
     corrected : Hypotheses
-        These hypotheses in the poses that the new first judge corrected.
+        The hypotheses before the fit, in the poses that the new first judge corrected at the second look.
     fitted : Hypotheses
-        These hypotheses after the fit.
+        The hypotheses after the fit.
     """
 
     log_odds: Float
@@ -95,7 +95,7 @@ def _unpack_judge(packed: bytes) -> Judge:
 def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
     """Return the hypotheses of one image at the two looks of the first judge.
 
-    ``train`` : draw specks into the image, and show less likely hypotheses again.
+    ``train`` : draw specks into one image in three, and admit less likely hypotheses to the second look.
     """
     detector = load_places_detector(detector_path)
     grey, keypoints = read_image(image, train)
@@ -121,12 +121,12 @@ def collect_fits(
     """Return the hypotheses of one image after two looks of the new first judge and after the fit.
 
     ``train`` : draw the same specks, and fit less likely hypotheses. The first judge is very sure about the images that
-    trained it; without less likely hypotheses the second judge would see too few wrong ones.
+    trained it. Without less likely hypotheses, the second judge would see too few wrong hypotheses.
     """
     patches, new_judge = load_places_detector(detector_path).patches, _unpack_judge(packed_judge)
     pyramids, margin = Pyramids(read_image(image, train)[0]), TRAINING_MARGIN if train else 0.0
     threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # one image is too little work for more
+    torch.set_num_threads(1)  # one image is too little work for several threads
     log_odds, corrected = apply_judge(new_judge, first_look, patches)
     second_look = look_again(pyramids, corrected[log_odds >= SECOND_LOOK_LOG_ODDS - margin], patches)
     log_odds, corrected = apply_judge(new_judge, second_look, patches)
@@ -140,8 +140,8 @@ def collect_fits(
 def read_image(image: ImageRef, speckle: bool) -> tuple[UInt8, NDArray[Any]]:
     """Return one image in grey and its keypoints; with ``speckle``, one image in three gets specks beside its patches.
 
-    Specks measure 1 to 6 px. They stand for hot pixels, dust, distant leaves and distant windows: these look most like
-    small patches.
+    Specks measure 1 to 6 px. Specks stand for hot pixels, dust, distant leaves and distant windows, which are often
+    mistaken for small patches.
     """
     grey, keypoints = image.read()
     if not speckle or image.index % SPECKLED_EVERY:

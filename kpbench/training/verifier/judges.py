@@ -1,12 +1,13 @@
 """Training of the two judges (:func:`kpbench.detectors.verification.judge`).
 
-Both judges have the same small network. A hypothesis is right if its centre lies near a keypoint of its design: within
-a fifth of the radius for the first judge, before the fit, and within a tenth for the second judge, after the fit. Of
-two rotations of a design at one place, only the better one is right. Each judge also learns to correct the pose.
+Both judges have a small network of the same form. A hypothesis is right if its centre lies near a keypoint of its
+design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long semi-axes for the second
+judge, after the fit. Of several rotations of a design at one place, only the best rotation is right. Each judge also
+learns to correct the pose.
 
 The first judge is trained on the hypotheses of its first look and of its second look. For the second look, the shipped
 first judge corrects the poses, because the new judge does not exist yet. Hypotheses that the shipped first judge judges
-rightly and surely are drawn rarely, and get more weight.
+rightly and surely are drawn rarely, and a drawn hypothesis of this kind gets more weight.
 """
 
 from __future__ import annotations
@@ -46,9 +47,9 @@ from kpbench.training.verifier.small_networks import (
 from kpbench.types import Float
 
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
-"""Channels of the first layers of each judge."""
+"""Channels of the first layers of the first judge, and of the second judge."""
 KNOWN_SHARE = 12.0
-"""A hypothesis judged rightly with log odds ±z is drawn in an epoch with probability KNOWN_SHARE · exp(-z/2)."""
+"""A hypothesis judged rightly with log odds ±z is drawn with probability min(KNOWN_SHARE · exp(-z/2), 1) per epoch."""
 
 
 def train_judges(
@@ -72,7 +73,8 @@ def train_judges(
         As for :func:`kpbench.training.train_ellipse`. The report gives detection scores at several rates of false
         alarms.
     detector : Path, optional
-        Weights whose candidates are judged, written by ``kpbench export-model``. None: ``superpoint-small``.
+        Weights of the detector whose candidates are judged: a file of ``kpbench export-model``. None:
+        ``superpoint-small``.
 
     Raises
     ------
@@ -126,7 +128,7 @@ class _Settings:
 
 @dataclass(frozen=True)
 class LabelledHypotheses:
-    """Hypotheses of many images, and what a judge is asked for.
+    """Hypotheses of many images, with the targets of a judge.
 
     Attributes
     ----------
@@ -136,7 +138,7 @@ class LabelledHypotheses:
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
         Corrections that bring the poses to the truth.
     share : ndarray of shape (n,)
-        Probability that a hypothesis is drawn in an epoch; its weight is the inverse.
+        Probability that a hypothesis is drawn in an epoch. The weight of the hypothesis is 1 / ``share``.
     """
 
     hypotheses: Hypotheses
@@ -167,7 +169,7 @@ def _label(
 
 
 def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
-    """Train the first judge on the hypotheses of both looks."""
+    """Train the first judge on the hypotheses of both looks, which the shipped first judge has judged."""
     hypotheses = [look for image in looks for look in (image.first_look, image.second_look)]
     truths = [image.keypoints for image in looks for _ in range(2)]
     known = np.concatenate([image.shipped_log_odds for image in looks])
@@ -176,7 +178,7 @@ def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
 
 
 def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], settings: _Settings) -> Judge:
-    """Train the second judge on fitted hypotheses; no earlier judge has seen them."""
+    """Train the second judge on fitted hypotheses, which no earlier judge has judged."""
     unknown = np.zeros(sum(map(len, fitted)))
     training = _label(fitted, settings.patches, truths, unknown, FIT_TOLERANCE)
     return _train(training, SECOND_JUDGE, SECOND_WIDTH, settings)
@@ -219,7 +221,7 @@ def _train(training: LabelledHypotheses, name: str, width: int, settings: _Setti
 
 
 def _disturb(view: Tensor) -> Tensor:
-    """Return views whose image has other inks and a little noise; the design stays as it is."""
+    """Return views whose image has other inks and a little noise; the design is not changed."""
     shape = (len(view), 1, 1, 1)
     gain, offset = torch.exp(0.15 * torch.randn(shape)), 0.1 * torch.randn(shape)
     image = view[:, :1] * gain + offset + 0.1 * torch.rand(shape) * torch.randn_like(view[:, :1])

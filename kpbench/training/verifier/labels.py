@@ -15,11 +15,11 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Int
 
 POSE_TOLERANCE, FIT_TOLERANCE = 0.2, 0.1
-"""Largest distance of a right centre from the truth, before and after the fit, in long semi-axes."""
+"""Largest distance of a right centre from the true centre, before and after the fit, in long semi-axes."""
 NEAR_RADII = 0.5
-"""Long semi-axes. A judge learns the pose from hypotheses of the right design with a centre nearer than this."""
+"""A judge learns the pose from hypotheses of the right design within this distance, in long semi-axes."""
 LARGEST_LOG_MAP = 1.0
-"""A judge does not learn the pose from hypotheses with a larger error in any entry of the log map."""
+"""A judge does not learn the pose from a hypothesis with a larger error in an entry of the log map."""
 
 
 def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
@@ -30,7 +30,7 @@ def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
 def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
     """Return whether each place (n, 2) px lies near its nearest keypoint and has the patch ID of that keypoint.
 
-    ``tolerance`` : largest distance, in long semi-axes.
+    ``tolerance`` : largest distance, in long semi-axes of the keypoint.
     """
     if not len(keypoints):
         return np.zeros(len(xy), bool)
@@ -39,7 +39,7 @@ def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: 
 
 
 def _nearest_keypoint(xy: Float, keypoints: NDArray[Any]) -> tuple[Int, Float]:
-    """Return the nearest keypoint (n,) of each place, and its distance (n,), in its long semi-axes."""
+    """Return the nearest keypoint (n,) of each place, and the distance (n,) in long semi-axes of that keypoint."""
     distance = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"]) / keypoints["radius_major"]
     return distance.argmin(axis=1), distance.min(axis=1)
 
@@ -49,8 +49,8 @@ def label_hypotheses(
 ) -> NDArray[np.bool_]:
     """Return whether each hypothesis of an image is right.
 
-    A right hypothesis lies within ``tolerance`` long semi-axes of a keypoint and has its design. Of two rotations of a
-    design at one place, only the better one is right.
+    A right hypothesis lies within ``tolerance`` long semi-axes of a keypoint and has the keypoint's design. Of several
+    rotations of a design at one place, only the best rotation is right.
     """
     right = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, tolerance)
     rows = np.flatnonzero(right)
@@ -58,7 +58,7 @@ def label_hypotheses(
         own, _ = _nearest_keypoint(hypotheses.xy[rows], keypoints)
         relative = np.linalg.inv(hypotheses.A[rows]) @ affine_at_centre(keypoints["H_patch2image"][own])
         angle = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-        # a design that looks the same after half a turn has half as many rotations
+        # a design that looks the same after half a turn has half as many templates, and the period of half a turn
         rotations = np.bincount(build_templates(patches).whole.rotated_design)
         period = (2 * np.pi * rotations / rotations.max())[hypotheses.design[rows]]
         error = np.abs((angle + period / 2) % period - period / 2)
@@ -78,7 +78,7 @@ def pose_errors(
     near : ndarray of shape (n,), bool
         Whether a hypothesis has the right design and a pose near the truth.
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
-        See :func:`kpbench.detectors.verification.move_poses`; 0 where ``near`` is false, or far from the truth.
+        See :func:`kpbench.detectors.verification.move_poses`. Rows where ``near`` is false have no meaning.
     """
     shift, log_map = np.zeros((len(hypotheses), 2)), np.zeros((len(hypotheses), 2, 2))
     near = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, NEAR_RADII)
@@ -94,11 +94,11 @@ def pose_errors(
 
 
 def affine_at_centre(H: Float) -> Float:
-    """Return the derivatives (n, 2, 2) of homographies (n, 3, 3) at the origin."""
+    """Return the Jacobians (n, 2, 2) of homographies (n, 3, 3) at the origin."""
     return H[:, :2, :2] / H[:, 2:, 2:] - H[:, :2, 2:] @ H[:, 2:, :2] / H[:, 2:, 2:] ** 2
 
 
 def log_ellipse(A: Float) -> Float:
-    """Return the logarithms (n, 2, 2) of the symmetric maps that give the same ellipses as maps A (n, 2, 2)."""
+    """Return the logarithms (n, 2, 2) of the symmetric maps that take the unit circle to the same ellipses as A."""
     square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
     return np.asarray(np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes))

@@ -71,12 +71,12 @@ def train_one_cycle(
     network : nn.Module
         Changed in place; in evaluation mode afterwards.
     loss : callable
-        Loss of the samples at some rows.
+        Takes rows, and returns the loss of the samples at these rows.
     draw_rows : callable
         Returns the rows of an epoch, in random order.
     epochs, batch : int
     learning_rate : float
-        The highest one.
+        Highest learning rate of the cycle.
     """
     network.eval()
     steps = epochs * (len(draw_rows()) // batch)
@@ -85,7 +85,7 @@ def train_one_cycle(
     network.train()
     optimizer = torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, learning_rate, total_steps=steps)
-    in_bf16 = bool(torch.cpu._is_avx512_bf16_supported())  # takes about half the time there
+    in_bf16 = bool(torch.cpu._is_avx512_bf16_supported())  # bfloat16 halves the time on such processors
     with progress_bar("train", steps) as bar:
         step = 0
         while step < steps:
@@ -104,9 +104,10 @@ def train_one_cycle(
 
 @torch.no_grad()
 def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> None:
-    """Give a network the shipped weights, to the precision of their 7 bits.
+    """Give a network the shipped weights; the weights of convolutions are stored in 7 bits.
 
-    The shipped file has no BatchNorm. Each BatchNorm becomes the identity; the inputs ``seen`` give its statistics.
+    The shipped file has no BatchNorm. Each BatchNorm becomes the identity, apart from the bias of its convolution; the
+    inputs ``seen`` give the statistics.
     """
     graph = onnx.load(WEIGHTS / f"{name}.onnx").graph
     stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
@@ -132,15 +133,15 @@ def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> Non
 def write_network(
     network: nn.Module, inputs: Sequence[str], seen: Sequence[tuple[Tensor, ...]], file: Path, say: Say
 ) -> None:
-    """Write a network as an ONNX file in 8-bit integers, for any number of places.
+    """Write a network as an ONNX file in 8-bit integers; the file takes any number of places.
 
     Parameters
     ----------
     network : nn.Module
     inputs : sequence of str
-        Names of its inputs.
+        Names of the network's inputs.
     seen : sequence of tuple of Tensor
-        Inputs that give the ranges of the integers.
+        Inputs on which the ranges of the activations are measured.
     file : Path
     say : callable
     """
