@@ -60,7 +60,7 @@ def patch_names(dataset: Dataset) -> dict[int, str]:
 
 
 def dataset_facts(dataset: Dataset) -> dict[str, str]:
-    """Return facts about the whole dataset: the text of each fact by the name of the fact.
+    """Return facts about the whole dataset, as a mapping from names to texts.
 
     Examples
     --------

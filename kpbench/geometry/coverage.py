@@ -7,7 +7,7 @@ Each pixel gets the area of the polygon within the pixel, without sampling. The 
    the pixel on the right.
 3. Sum along the rows. The sum carries the height of each piece to all pixels right of the piece.
 
-Besides the sum over the box, the cost grows with the length of the outline, not with the area inside.
+The cost of steps 1 and 2 grows with the length of the outline, not with the area inside.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Box = tuple[int, int, int, int]
 
 
 def bounding_box(polygons: Sequence[Float]) -> Box:
-    """Return the smallest box that :func:`rasterise` accepts for polygons. The box includes a margin of one pixel.
+    """Return the smallest box that :func:`rasterise` accepts for the polygons, with a margin of one pixel.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
 
 @dataclass(frozen=True)
 class Ellipse:
-    """An ellipse: centre and semi-axes in px, and the angle of the major axis from +x towards +y, in [0, 180) degrees."""
+    """An ellipse: centre and semi-axes in px; angle of the major axis in [0, 180) degrees, from +x towards +y."""
 
     x: float
     y: float

@@ -151,7 +151,7 @@ def flatten(region: Region, tolerance: float) -> list[Float]:
     """Approximate every contour by a closed polygon.
 
     Each arc becomes chords that enclose the same area as the arc, see :func:`arc_vertices`. The distance between the
-    chords and the arc is at most ``tolerance``. The mean signed distance along the arc is zero.
+    chords and the arc is at most ``tolerance``. The mean signed distance along the arc is zero to first order.
 
     Parameters
     ----------

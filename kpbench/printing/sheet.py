@@ -54,7 +54,7 @@ class Sheet:
 
 
 def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageFormat, copies: int = 1) -> Sheet:
-    """Lay out patches to cut out in rows and columns of equal cells, on as few pages as possible.
+    """Lay out patches to cut out, on as few pages as possible.
 
     Parameters
     ----------
