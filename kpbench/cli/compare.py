@@ -21,8 +21,8 @@ def compare(files: tuple[Path, ...], fail_on_regression: bool, **arguments: Any)
     """Compare the first of several predictions files with each of the others, on the same dataset.
 
     Differences are paired: the resamples for the 95 % intervals draw the same scenes for both detectors. With
-    --fail-on-regression, the exit code is 1 if the first detector has a worse detection score, ID matching score or
-    false alarms over all images, and the interval of this difference does not contain 0.
+    --fail-on-regression, the exit code is 1 if the first detector has a lower detection score, a lower ID matching
+    score or more false alarms over all images, and the interval of this difference does not contain 0.
 
     \b
     Examples:

@@ -76,7 +76,9 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
             help="literal: the paper's formulas as printed. Several detections of a keypoint then all count.",
         ),
         click.option(
-            "--allow-missing", is_flag=True, help="Score an image without predictions as an image without detections."
+            "--allow-missing",
+            is_flag=True,
+            help="Score an image missing from the predictions as an image without detections.",
         ),
         click.option(
             "--report",

@@ -33,7 +33,8 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--images",
     type=int,
-    help="Number of base scenes. Each is rendered with every patch under every rung. Default: 500, or as in NAME.toml.",
+    help="Number of base scenes. Each is rendered with every patch under every rung. "
+    "Default: 500 for shipped suites, else as in the .toml file.",
 )
 @SEED
 @BACKGROUNDS

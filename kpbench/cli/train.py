@@ -38,7 +38,9 @@ def _needs_torch(command: str) -> Iterator[None]:
     help="Train the verifier's networks on DATASETs, instead of the detector's network.",
 )
 @click.option(
-    "--test", type=click.Path(path_type=Path), help="With --verifier: dataset that calibrates and tests the networks."
+    "--test",
+    type=click.Path(path_type=Path),
+    help="With --verifier: dataset for the report, and for the calibration of ellipse.",
 )
 @click.option(
     "--epochs",
