@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     type=click.Choice(["none", "paper", "ladder"]),
     default="paper",
     show_default=True,
-    help="Effects on the images. paper: as in the paper. ladder: one or two effects of kpbench degrade, mild to severe.",
+    help="Effects on images. paper: as in the paper. ladder: one or two effects of kpbench degrade, mild to severe.",
 )
 @click.option(
     "--radius-px",
