@@ -1,4 +1,4 @@
-"""The command line: parse, call one function of the library, print. Nothing imports it."""
+"""The command line. A command parses its options, calls the library, and prints. The library never imports this."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from kpbench import __version__
 from kpbench.errors import KpbenchError
 
 # The module of a command is imported when the command is run: `kpbench --help` must not wait for OpenCV, HDF5 or torch.
-# Each entry holds the place of a command and its line in the list of commands.
+# Each entry holds the module and function of a command, and the description of the command in `kpbench --help`.
 COMMANDS = {
     "render-patches": ("print:render_patches", "Print the patches or a board, true to scale."),
     "analyze-patches": ("analyze:analyze_patches", "Measure how well designs can be located and told apart."),
     "synth": ("synth:synth", "Write a synthetic labelled dataset."),
-    "merge": ("synth:merge", "Make one dataset of shards that several runs made."),
+    "merge": ("synth:merge", "Make one dataset from the shards of several runs."),
     "suite": ("suite:suite", "Write the images of a benchmark suite: paper-v1, extended-v1."),
     "degrade": ("degrade:degrade", "Degrade images of your own: blur, noise, rain, ..."),
     "inspect": ("dataset:inspect", "Print what a dataset holds."),
@@ -28,7 +28,7 @@ COMMANDS = {
     "detect": ("detect:detect", "Run a detector over a dataset or image files."),
     "score": ("score:score", "Score a predictions file with the paper's metrics."),
     "compare": ("compare:compare", "Compare detectors on the same images, pair by pair."),
-    "bench": ("benchmark:bench", "Make suites, run detectors, score them beside the paper."),
+    "bench": ("benchmark:bench", "Make suites, run and score detectors, compare with the paper."),
     "train": ("train:train", "Train the detector, or its verifier; needs kpbench[train]."),
     "export-model": ("train:export_model", "Write trained weights as an ONNX file."),
     "demo": ("demo:demo", "Run the whole chain with few images, in about a minute."),
@@ -36,7 +36,7 @@ COMMANDS = {
 
 
 class LazyGroup(click.Group):
-    """The group of all commands: it imports a command when it is run, and turns errors into exit codes."""
+    """The group of all commands. Imports a command when the command is run. Turns errors into exit codes."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
@@ -58,10 +58,11 @@ class LazyGroup(click.Group):
         except KpbenchError as error:
             click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
-        except OSError as error:  # mostly of standard output: a file that kpbench cannot write is a KpbenchError
-            if not isinstance(error, BrokenPipeError):  # the reader of the pipe closed it, and knows
+        except OSError as error:  # of standard output, as a rule: an unwritable file is a KpbenchError
+            if not isinstance(error, BrokenPipeError):  # the reader closed the pipe: no message needed
                 click.echo(f"kpbench: {error.strerror or error}", err=True)
-            with contextlib.suppress(OSError, ValueError):  # else Python writes again when it ends, and exits with 120
+            # without a new stdout, Python writes to the broken one at exit, and exits with 120
+            with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
@@ -69,8 +70,8 @@ class LazyGroup(click.Group):
             sys.exit(130)
 
     def _translate(self, ctx: click.Context, problem: BaseException) -> str:
-        """Return the message of a problem in the words of the command that met it."""
-        from kpbench.cli.messages import name_options  # here, as it would slow down `kpbench --help`
+        """Return the message of a problem, with parameters of the library named as options of the command."""
+        from kpbench.cli.messages import name_options  # imported here to keep `kpbench --help` fast
 
         return name_options(str(problem), self.get_command(ctx, ctx.invoked_subcommand or ""))
 

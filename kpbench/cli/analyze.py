@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def figure_suffixes() -> Iterable[str]:
-    """Return the suffixes of figures."""
+    """Return the suffixes of figure files."""
     from kpbench.analysis.figure import FIGURE_SUFFIXES
 
     return FIGURE_SUFFIXES
@@ -74,7 +74,7 @@ def analyze_patches(
 
 
 def _tables(analysis: Analysis) -> list[Table]:
-    """Return the measures as tables with a row per design: bounds, other measures, and distances between designs."""
+    """Return three tables with a row per design: bounds, other measures, and distances between designs."""
     from kpbench.report.tables import Table
 
     names = [f"{design.patch_id} {design.name}" for design in analysis.designs]

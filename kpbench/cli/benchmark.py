@@ -8,11 +8,13 @@ from pathlib import Path
 import click
 
 from kpbench.cli.messages import print_warning
-from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
+from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, WORKERS
 
 
 @click.command()
-@click.option("--suite", "suites", multiple=True, default=["paper-v1"], show_default=True, help="Repeatable.")
+@click.option(
+    "--suite", "suites", multiple=True, default=["paper-v1"], show_default=True, help="Suite to run; repeatable."
+)
 @click.option(
     "--detector",
     "detectors",
@@ -29,11 +31,17 @@ from kpbench.cli.options import ONLY, SEED, SIZE, WORKERS
     help="Folder for all files; finished work in it is kept.",
 )
 @click.option("--quick", is_flag=True, help="For a laptop: the same as --images 20 --size 640x480.")
-@click.option("--images", type=int, help="Base scenes, each seen with every board under every rung; default: 500.")
-@click.option("--size", type=SIZE, help="Scale the camera, same field of view; default: 1624x1240.")
+@click.option(
+    "--images",
+    type=int,
+    help="Number of base scenes. Each is rendered with every board under every rung. Default: 500.",
+)
+@click.option(
+    "--size", type=SIZE, help="Width and height in px of a camera with the same field of view. Default: 1624x1240."
+)
 @ONLY
 @SEED
-@click.option("--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs; else procedural ones.")
+@BACKGROUNDS
 @WORKERS
 def bench(
     suites: tuple[str, ...],
@@ -47,10 +55,10 @@ def bench(
     backgrounds: Path | None,
     workers: int | None,
 ) -> None:
-    """Make the suites, run the detectors, score them, and set the tables beside the paper's.
+    """Make the suites, run the detectors, and compare the scores with the paper's scores.
 
-    Detectors of tags get boards of tags in the same scenes. The same command continues an interrupted run. It prints
-    the tables as Markdown, and writes a report per suite, and the scores and predictions of each detector.
+    Detectors of tags get boards of tags in the same scenes. The same command continues an interrupted run. The command
+    prints tables as Markdown. It writes a report per suite, and the scores and the predictions of each detector.
 
     \b
     Examples:
@@ -77,7 +85,7 @@ def bench(
         with progress_bar(count_bench_images(configs, detectors), "bench") as progress:
             runs = run_bench(configs, detectors, out, workers=workers, progress=progress)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("what is done is kept; the same command goes on") from None
+        raise KeyboardInterrupt("finished work is kept; the same command continues the run") from None
     for report in write_suite_reports(runs, out, command=["kpbench", *sys.argv[1:]]):
         for table in report.tables:
             click.echo(to_markdown(table))

@@ -16,13 +16,13 @@ from kpbench.cli.score import FILE, scoring_options
 @click.argument("files", nargs=-1, required=True, type=FILE)
 @scoring_options
 @click.option("--json", "json_file", type=FILE, help="Write all differences.")
-@click.option("--fail-on-regression", is_flag=True, help="Exit 1 if the first is worse over all images.")
+@click.option("--fail-on-regression", is_flag=True, help="Exit 1 if the first detector is worse over all images.")
 def compare(files: tuple[Path, ...], fail_on_regression: bool, **arguments: Any) -> None:
     """Compare the first of several predictions files with each of the others, on the same dataset.
 
-    Differences are paired: each resample behind their 95 % intervals draws the same scenes for both detectors. With
-    --fail-on-regression the exit code is 1 if detection score, ID matching score or false alarms of the first are
-    worse over all images and the interval of the difference does not contain 0.
+    Differences are paired: the resamples for the 95 % intervals draw the same scenes for both detectors. With
+    --fail-on-regression, the exit code is 1 if the first detector has a lower detection score, a lower ID matching
+    score or more false alarms over all images, and the interval of this difference does not contain 0.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""``kpbench inspect``, ``verify``, ``preview`` and ``export``: what is done with a finished dataset."""
+"""``kpbench inspect``, ``verify``, ``preview`` and ``export``, the commands for a finished dataset."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 @click.command()
 @DATASET
 def inspect(dataset: Path) -> None:
-    """Print what a dataset holds: its size, its counts, and histograms of its keypoints.
+    """Print facts about a dataset, and histograms of its keypoints.
 
     \b
     Examples:

@@ -24,7 +24,7 @@ from kpbench.cli.options import FINITE, SEED
 def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
     """Degrade an image, or all images of a folder, and write them as PNG.
 
-    Prints one line per image: the file that was written, then the applied effects as JSON.
+    The command prints one line per image: the written file, then the applied effects as JSON.
 
     \b
     Effects and their rungs in the suites:

@@ -10,7 +10,7 @@ from kpbench.cli.messages import print_warning
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
-"""Detectors of the shipped designs. Only template takes others, with --patches."""
+"""Detectors that look for the shipped designs. Of these, only template looks for other designs, with --patches."""
 
 
 @click.command()
@@ -31,12 +31,12 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 @click.option(
     "--threshold",
     type=FINITE,
-    help="Least score of a detection. Default: the detector's own; shipped detectors have 0.3.",
+    help="Least score of a detection. Default: set by the detector; 0.3 for shipped detectors.",
 )
 @click.option(
     "--overlay",
     type=click.Path(path_type=Path),
-    help="Draw the detections into a folder, a video (.mp4), or a .png of a single image.",
+    help="Draw the detections: into a folder, a video (.mp4), or for a single image a .png.",
 )
 @PATCHES
 @WORKERS

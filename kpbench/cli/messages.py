@@ -1,4 +1,4 @@
-"""What the library says, in the words of a command: its parameters become the command's options."""
+"""Messages of the library for the command line: names of parameters become names of options."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ OPTION_OF = {
     "shards": "--shard-range",
     "size_px": "--size",
 }
-"""Options whose name is not that of the library's parameter, for all commands."""
+"""Options whose names differ from the names of the library's parameters, for all commands."""
 
 
 def name_options(message: str, command: click.Command | None) -> str:
     """Translate parameters that the library names in backticks into options and arguments of a command.
 
-    `n` becomes --n, `limits.radius_px` becomes --radius-px, `resume=True` becomes --resume, `channels=3` becomes
-    --channels 3, and `parts` becomes PARTS where it is an argument. Text in backticks that names no parameter of the
-    command stays, such as a metric or another command.
+    `n` becomes --n, `limits.radius_px` becomes --radius-px, `resume=True` becomes --resume, and `channels=3` becomes
+    --channels 3. `parts` becomes PARTS if the command has this argument. Other text in backticks stays, such as a
+    metric or another command.
     """
     if command is None:
         return message
@@ -38,5 +38,5 @@ def name_options(message: str, command: click.Command | None) -> str:
 
 
 def print_warning(message: str) -> None:
-    """Print one line to stderr, in the words of the command that runs."""
+    """Print one line to stderr, with parameters of the library named as options of the running command."""
     click.echo(f"kpbench: {name_options(message, click.get_current_context().command)}", err=True)

@@ -13,7 +13,7 @@ Number = TypeVar("Number", bound=float)
 
 
 class Two(click.ParamType[tuple[Number, Number]], Generic[Number]):
-    """Two numbers with a separator between them; the value is a tuple."""
+    """Two numbers with a separator between them, parsed into a tuple."""
 
     def __init__(self, kind: type[Number], name: str, separator: str, example: str) -> None:
         self.kind, self.name, self.separator, self.example = kind, name, separator, example
@@ -29,7 +29,7 @@ class Two(click.ParamType[tuple[Number, Number]], Generic[Number]):
 
 
 class Names(click.ParamType[tuple[str, ...]]):
-    """Names with commas between them; the value is a tuple."""
+    """Names with commas between them, parsed into a tuple."""
 
     name = "NAME,…"
 
@@ -51,9 +51,9 @@ class Finite(click.FloatRange):
 
 
 class FileOfSuffix(click.Path):
-    """A file to write whose name ends in one of some suffixes.
+    """A file to write. Its name must end in one of the given suffixes.
 
-    The suffixes come from a function, which may import what ``kpbench --help`` must not wait for.
+    A function returns the suffixes. The function may import slow modules without delaying ``kpbench --help``.
     """
 
     def __init__(self, suffixes: Callable[[], Iterable[str]]) -> None:
@@ -76,7 +76,7 @@ ONLY = click.option(
     "--only", type=Names(), default="", help="Only these conditions, such as scale,blur. Default: all conditions."
 )
 SEED = click.option(
-    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of everything that is random."
+    "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of all random choices."
 )
 WORKERS = click.option("--workers", type=click.IntRange(min=1), help="Number of processes. Default: one per core.")
 PATCHES = click.option(
@@ -89,7 +89,7 @@ PATCHES = click.option(
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of every command that writes a dataset: where it is made, and what happens to an earlier run."""
+    """Add the options of a command that writes a dataset: where shards are made, and what happens to an earlier run."""
     for option in reversed((
         WORKERS,
         click.option(
@@ -101,7 +101,7 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
         ),
         click.option("--scheduler", metavar="ADDR", help="Address of the Dask scheduler, such as tcp://host:8786."),
         click.option(
-            "--shard-range", type=SHARDS, help="Make only shards A to B - 1, counted from 0. kpbench merge joins them."
+            "--shard-range", type=SHARDS, help="Make only shards A to B - 1, counted from 0; see kpbench merge."
         ),
         click.option("--resume", is_flag=True, help="Keep the finished shards of an interrupted run, make the rest."),
         click.option("--overwrite", is_flag=True, help="Delete the dataset in the folder first."),

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     "--pdf", is_flag=True, help="Write a vector PDF that asks the viewer not to scale. This is the default format."
 )
 @click.option("--svg", is_flag=True, help="Write SVG in mm with true arcs.")
-@click.option("--png", is_flag=True, help="Write 8-bit grey PNG that holds its resolution.")
+@click.option("--png", is_flag=True, help="Write 8-bit grey PNG. The file contains its resolution.")
 @click.option("--dxf", is_flag=True, help="Write DXF in mm with true arcs, for laser cutters and plotters.")
 @click.option(
     "--diameter-mm",
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 @click.option(
     "--measured",
     type=Two(float, "X_MM,Y_MM", ",", "99.8,100.1"),
-    help="Lengths of the two rulers on the paper. Corrects the sidecars in --out and prints nothing.",
+    help="Measured lengths of the two rulers on the paper. Correct the sidecars in --out instead of printing.",
 )
 @click.pass_context
 def render_patches(
@@ -85,8 +85,8 @@ def render_patches(
 ) -> None:
     """Print the patches or a board, true to scale.
 
-    Writes ./patches-print/patches.pdf, and patches.json with the position of every keypoint. Print at 100 %, then
-    measure the two rulers on the paper.
+    The command writes ./patches-print/patches.pdf, and patches.json with the position of every keypoint. Print the PDF
+    at 100 %, then measure the two rulers on the paper.
 
     \b
     Examples:
@@ -129,7 +129,7 @@ def render_patches(
 def _check_usage(given: set[str], board: str | None) -> None:
     """Refuse options that do not go together."""
     if "measured" in given and given - {"measured", "out"}:
-        raise click.UsageError("--measured corrects what is in --out and takes no other option.")
+        raise click.UsageError("--measured corrects the sidecars in --out and takes no other option.")
     if board is None and "tile" in given:
         raise click.UsageError("--tile spreads a board; give --board.")
     if board is not None and "copies" in given:
@@ -139,7 +139,7 @@ def _check_usage(given: set[str], board: str | None) -> None:
 
 
 def _boards(name: str, patches: Sequence[Patch], own: bool, diameter_mm: float | None) -> list[Board]:
-    """Make the boards that --board asks for: hexagons of one design each, one grid, or the board of a file."""
+    """Make the boards that --board asks for: a hexagon per design, one grid, or the board of a file."""
     from kpbench.errors import DesignError
     from kpbench.patches.board import HEXAGON_DIAMETER, grid_board, hexagon_board
     from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, GRID_PITCH, load_board

@@ -1,4 +1,4 @@
-"""The progress bar of the commands: only on a terminal, with rate and time left."""
+"""The progress bar of the commands, with rate and time left. The bar is shown on a terminal only."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from kpbench.workers import Progress
 
 @contextmanager
 def progress_bar(total: int | None, title: str, unit: str = "img", shown: bool = True) -> Iterator[Progress]:
-    """Show a bar on stderr over ``total`` images; yield the function that advances the bar by a number of images.
+    """Show a progress bar on stderr. Yield the function that advances the bar by a number of units.
 
-    ``unit`` names another thing than images that the bar counts. ``total`` is None if their number is not known.
+    ``unit`` names what the bar counts; the default is images. ``total`` is the number of units, or None if unknown.
     """
     from tqdm import tqdm
 

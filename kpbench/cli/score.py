@@ -36,7 +36,7 @@ class Limit(click.ParamType[tuple[str, float]]):
 
 
 def report_suffixes() -> Iterable[str]:
-    """Return the suffixes of reports."""
+    """Return the suffixes of report files."""
     from kpbench.report.report import REPORT_WRITERS
 
     return REPORT_WRITERS
@@ -46,20 +46,20 @@ FILE = click.Path(dir_okay=False, path_type=Path)
 
 
 def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of the truth, of a match and of the report to a command."""
+    """Add the options for the ground truth, the matching and the report to a command."""
     options = (
         click.option(
             "--gt",
             "truth",
             type=click.Path(path_type=Path),
-            help="Dataset or COCO annotations (.json); default: as the predictions name it, else ./kpbench-data.",
+            help="Dataset or COCO annotations (.json). Default: the path in the predictions, else ./kpbench-data.",
         ),
         click.option(
             "--eps",
             type=Finite(min=0),
             default=0.1,
             show_default=True,
-            help="Largest distance of a match, in radii of the keypoint.",
+            help="Matching threshold: largest distance from detection to keypoint, in radii of the keypoint.",
         ),
         click.option(
             "--eps-radius",
@@ -73,10 +73,12 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
             type=click.Choice(["one-to-one", "literal"]),
             default="one-to-one",
             show_default=True,
-            help="literal: the paper's formulas as printed; several detections of a keypoint all count.",
+            help="literal: the paper's formulas as printed. Several detections of a keypoint then all count.",
         ),
         click.option(
-            "--allow-missing", is_flag=True, help="Take an image without prediction as an image without detections."
+            "--allow-missing",
+            is_flag=True,
+            help="Score an image missing from the predictions as an image without detections.",
         ),
         click.option(
             "--report",
@@ -96,7 +98,7 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row per condition, rung and patch.")
 @click.option(
-    "--pose", is_flag=True, help="Compute errors of the board's pose too; the dataset must be that of a suite."
+    "--pose", is_flag=True, help="Also compute errors of the board's pose. The dataset must be made by kpbench suite."
 )
 @click.option("--min", "least", type=Limit(), multiple=True, help="Exit 1 if a metric is lower; repeatable.")
 @click.option("--max", "most", type=Limit(), multiple=True, help="Exit 1 if a metric is higher; repeatable.")

@@ -11,7 +11,7 @@ from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, run_options
 
 
 class Distortion(click.ParamType[tuple[float, ...]]):
-    """One to five numbers ``k1,k2,p1,p2,k3``; the value is a tuple."""
+    """One to five numbers ``k1,k2,p1,p2,k3``, parsed into a tuple."""
 
     name = "k1,k2,p1,p2,k3"
 
@@ -33,7 +33,8 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--images",
     type=int,
-    help="Number of base scenes. Each is seen with every patch under every rung. Default: 500, or as the file says.",
+    help="Number of base scenes. Each is rendered with every patch under every rung. "
+    "Default: 500 for shipped suites, else as in the .toml file.",
 )
 @SEED
 @BACKGROUNDS
@@ -42,7 +43,7 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 )
 @ONLY
 @click.option(
-    "--distortion", type=Distortion(), help="Lens distortion, by the coefficients of OpenCV. Default: no distortion."
+    "--distortion", type=Distortion(), help="OpenCV's coefficients of lens distortion. Default: no distortion."
 )
 @click.option(
     "--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Show a board of tags instead of the patches."

@@ -1,4 +1,4 @@
-"""``kpbench synth`` and ``merge``, and how a command writes a dataset."""
+"""``kpbench synth`` and ``merge``, and the function with which commands write a dataset."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
     type=click.Choice(["none", "paper", "ladder"]),
     default="paper",
     show_default=True,
-    help="none; paper: as the paper does; ladder: one or two effects of kpbench degrade, mild to severe.",
+    help="Effects on images. paper: as in the paper. ladder: one or two effects of kpbench degrade, mild to severe.",
 )
 @click.option(
     "--radius-px",
     type=Two(float, "LEAST:MOST", ":", "5:80"),
     default="5:80",
     show_default=True,
-    help="Radii of the discs before tilt, in px. The short semi-axis stays at least LEAST, or 5 px if LEAST is more.",
+    help="Radii of the discs before tilt, in px. The minor semi-axis is at least LEAST or 5 px, whichever is less.",
 )
 @click.option(
     "--distractors",
     type=click.IntRange(0, 1000),
     default=0,
     show_default=True,
-    help="Most look-alikes per image: discs, rings, half-patches, chequers, text. They have no label.",
+    help="Largest number of unlabelled look-alikes per image: discs, rings, half-patches, chequers, text.",
 )
 @click.option(
     "--augment",
     type=click.Path(path_type=Path),
-    help="albumentations pipeline of your own, as albumentations.save writes it (JSON or YAML). It is applied last.",
+    help="Your own albumentations pipeline, a file of albumentations.save (JSON or YAML). Applied last.",
 )
 @click.option(
-    "--shard-size", type=int, default=500, show_default=True, help="Number of images per shard, which is a file."
+    "--shard-size", type=int, default=500, show_default=True, help="Number of images per shard. A shard is one file."
 )
 @run_options
 def synth(
@@ -109,10 +109,10 @@ def synth(
 @click.argument("dataset", type=click.Path(path_type=Path))
 @click.argument("parts", nargs=-1, type=click.Path(path_type=Path))
 def merge(dataset: Path, parts: tuple[Path, ...]) -> None:
-    """Make one dataset of the shards that several runs with --shard-range made.
+    """Make one dataset from the shards of several runs with --shard-range.
 
-    Checks that every shard is there and undamaged, then writes the manifest. PARTS are folders; their shards are
-    linked or copied into DATASET. Leave PARTS out if all runs wrote into DATASET.
+    The command checks that every shard is present and undamaged, then writes the manifest. PARTS are folders. Their
+    shards are linked or copied into DATASET. Leave PARTS out if all runs wrote into DATASET.
 
     \b
     Examples:
@@ -137,7 +137,7 @@ def write_dataset(
     resume: bool,
     overwrite: bool,
 ) -> None:
-    """Write a dataset with a progress bar of this title, and print a line about it.
+    """Write a dataset, show a progress bar with a title, and print one line about the dataset.
 
     The keyword parameters are the options of ``run_options``.
     """
@@ -160,7 +160,7 @@ def write_dataset(
                 return
             result = generate(config, out, **how)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command with --resume goes on") from None
+        raise KeyboardInterrupt(f"finished shards are kept in {out}; add --resume to continue the run") from None
     if result.broken_files:
         shown = ", ".join(result.broken_files[:5]) + (" …" if len(result.broken_files) > 5 else "")
         print_warning(f"{len(result.broken_files)} background files could not be decoded and were passed over: {shown}")

@@ -12,16 +12,16 @@ import click
 from kpbench.cli.options import BACKGROUNDS, PATCHES
 
 EPOCHS = {"ellipse": 6, "judges": 10}
-"""Default of --epochs, per choice of --verifier."""
+"""Default of --epochs for each choice of --verifier."""
 VERIFIER_ONLY = {"datasets", "test", "epochs", "detector"}
-"""Parameters that are for --verifier alone."""
+"""Parameters for training with --verifier only."""
 SHARED = {"verifier", "out", "init", "workers", "threads"}
-"""Parameters that are for both kinds of training."""
+"""Parameters for training with and without --verifier."""
 
 
 @contextmanager
 def _needs_torch(command: str) -> Iterator[None]:
-    """Turn an import error into the command that installs what is missing."""
+    """Turn the error of a missing module into a message with the command that installs the module."""
     try:
         yield
     except ModuleNotFoundError as error:
@@ -31,13 +31,17 @@ def _needs_torch(command: str) -> Iterator[None]:
 
 @click.command()
 @click.argument("datasets", nargs=-1, type=click.Path(path_type=Path), metavar="[DATASET]...")
-@click.option("--config", help="Recipe: the name of a shipped one, such as reference, or a TOML file.")
+@click.option("--config", help="Recipe: the name of a shipped recipe, such as reference, or a TOML file.")
 @click.option(
     "--verifier",
     type=click.Choice(list(EPOCHS)),
-    help="Train networks of the verification, on DATASETs, instead of the detector's network.",
+    help="Train the verifier's networks on DATASETs, instead of the detector's network.",
 )
-@click.option("--test", type=click.Path(path_type=Path), help="With --verifier: dataset that the report is about.")
+@click.option(
+    "--test",
+    type=click.Path(path_type=Path),
+    help="With --verifier: dataset for the report, and for the calibration of ellipse.",
+)
 @click.option(
     "--epochs",
     type=click.IntRange(min=0),
@@ -47,29 +51,29 @@ def _needs_torch(command: str) -> Iterator[None]:
     "--detector",
     type=click.Path(path_type=Path),
     metavar="FILE.onnx",
-    help="With --verifier judges: weights whose candidates are judged. Default: superpoint-small.",
+    help="With --verifier judges: weights of the detector whose candidates are judged. Default: superpoint-small.",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="Folder of the run. Default: runs/NAME of the recipe; runs/ellipse or runs/judges.",
+    help="Folder of the run. Default: runs/ and the recipe's name; with --verifier: runs/ellipse or runs/judges.",
 )
 @BACKGROUNDS
 @PATCHES
 @click.option(
     "--init",
-    help="Weights to start from: superpoint or superpoint-small (those that ship), an exported .onnx, a checkpoint, "
-    "or SuperPoint's (.pth, .safetensors); with --verifier: shipped. Default: random weights.",
+    help="Initial weights: superpoint or superpoint-small (shipped), an exported .onnx, a checkpoint, or SuperPoint's "
+    "published weights (.pth, .safetensors). With --verifier: shipped. Default: random weights.",
 )
-@click.option("--resume", is_flag=True, help="Go on from the checkpoint in the folder; --init is not used.")
-@click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time; --resume goes on later.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint in --out. --init is not used.")
+@click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time. Continue later with --resume.")
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
-    help="Number of processes that make samples. Default: 1; with --verifier one per core.",
+    help="Number of processes that make samples. Default: 1; with --verifier: one per core.",
 )
-@click.option("--threads", type=click.IntRange(min=1), help="Threads of PyTorch. Default: as PyTorch chooses.")
-@click.option("--tensorboard", is_flag=True, help="Write the log for TensorBoard too.")
+@click.option("--threads", type=click.IntRange(min=1), help="Number of PyTorch's threads. Default: chosen by PyTorch.")
+@click.option("--tensorboard", is_flag=True, help="Also write the log for TensorBoard.")
 @click.pass_context
 def train(
     ctx: click.Context,
@@ -91,8 +95,9 @@ def train(
 ) -> None:
     """Train the detector's network by a recipe, or the networks that verify its candidates.
 
-    The detector is trained on samples that are made on the fly; an interrupted run can be resumed to the bit. The
-    verifier is trained on synthetic DATASETs; it writes ellipse.onnx, or first-judge.onnx and second-judge.onnx.
+    The detector is trained on samples that are made on the fly. An interrupted run can be resumed; on a CPU, the
+    result is the same to the bit. The verifier is trained on synthetic DATASETs. Its training writes ellipse.onnx, or
+    first-judge.onnx and second-judge.onnx.
 
     \b
     Examples:
@@ -122,7 +127,7 @@ def train(
 
 
 def _spell(parameters: set[str]) -> str:
-    """Return parameters of the command as a user types them."""
+    """Return the names of the command's parameters as a user types them."""
     return ", ".join("DATASET" if name == "datasets" else f"--{name}" for name in sorted(parameters))
 
 
@@ -192,11 +197,11 @@ def _train_verifier(
 @click.command("export-model")
 @click.argument("checkpoint", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="ONNX file to write.")
-@click.option("--int8", is_flag=True, help="Write an exported ONNX file again in 8-bit integers, for processors.")
+@click.option("--int8", is_flag=True, help="Convert an exported ONNX file to 8-bit integers, for CPUs.")
 def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
-    """Write the trained network as one ONNX file, and check it against PyTorch.
+    """Write the trained network as one ONNX file, and compare the output of the file with PyTorch's.
 
-    With --int8 CHECKPOINT is such an ONNX file.
+    With --int8, CHECKPOINT is an ONNX file that export-model wrote.
 
     \b
     Examples:
@@ -213,7 +218,7 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
         raise DataError(f"{out}: expected a name ending in .onnx")
     if int8 != (checkpoint.suffix == ".onnx"):
         problem = "--int8 takes the .onnx file of export-model, not a checkpoint" if int8 else "is exported already"
-        raise DataError(f"{checkpoint}: {problem}; export-model makes CHECKPOINT to .onnx, and --int8 that to integers")
+        raise DataError(f"{checkpoint}: {problem}; export a checkpoint without --int8, and an .onnx file with --int8")
     refuse_overwrite([out], [checkpoint])
     done, other = (export_int8(checkpoint, out), "float32") if int8 else (export_onnx(checkpoint, out), "PyTorch")
     click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {other} by at most {done.difference:.1e}")

@@ -20,7 +20,7 @@ CARD_FILES = ("README.md", "preview.png")
 SIZE_CATEGORIES = (
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
 )  # fmt: skip
-"""Names that the Hugging Face hub gives to datasets of fewer images than a number."""
+"""Limits, and the Hugging Face hub's name for datasets with fewer images than each limit."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +53,14 @@ class Histogram:
 
 
 def patch_names(dataset: Dataset) -> dict[int, str]:
-    """Return the name of every patch ID; ``patch-ID`` where the dataset's config has no name."""
+    """Return the name of every patch ID. An ID without a name in the dataset's config gets the name ``patch-ID``."""
     known = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
     ids = sorted({*known, *dataset.truth.keypoints["patch_id"]})
     return {int(patch_id): known.get(int(patch_id), f"patch-{patch_id}") for patch_id in ids}
 
 
 def dataset_facts(dataset: Dataset) -> dict[str, str]:
-    """Return facts about the whole dataset, as texts by their names.
+    """Return facts about the whole dataset, as a mapping from names to texts.
 
     Examples
     --------
@@ -128,7 +128,7 @@ def _count_values(title: str, values: ArrayLike) -> Histogram:
 
 
 def _bin_values(title: str, values: ArrayLike, borders: list[float]) -> Histogram:
-    """Count the values between each two borders."""
+    """Count the values in each bin. A bin lies between two successive borders."""
     labels = tuple(f"{low:g} to {high:g}" for low, high in pairwise(borders))
     return Histogram(title, labels, np.histogram(np.asarray(values), borders)[0])
 
@@ -164,7 +164,7 @@ def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int
 
 
 def write_card(dataset: Dataset, folder: Path) -> None:
-    """Write the dataset card into a folder: ``README.md``, with the header that dataset hubs read, and its picture.
+    """Write the dataset card into a folder: ``README.md`` with the header that dataset hubs read, and ``preview.png``.
 
     Raises
     ------
@@ -191,8 +191,8 @@ tags: [keypoint-patches, simulated]
 |---|---|
 {facts}
 
-The images are simulated by kpbench; each is a function of the configuration in `dataset.json`, the seed and the
-background files. Where those are photographs, their licence holds for what is seen of them here.
+The images are simulated by kpbench. Each image is a function of the configuration in `dataset.json`, the seed and the
+background files. If the background files are photographs, the licence of the photographs holds for their visible parts.
 
 ```python
 import kpbench

@@ -8,7 +8,7 @@ from kpbench.dataset.shard import Sample
 
 
 class DatasetConfig(Protocol):
-    """The configuration of a dataset; with the background files, it determines every image.
+    """A configuration of a dataset. The configuration and the background files determine every image.
 
     A configuration is picklable and hashable. kpbench has two: :class:`kpbench.SynthConfig` and
     :class:`kpbench.SuiteConfig`.
@@ -34,11 +34,11 @@ class DatasetConfig(Protocol):
 
     @property
     def image_bytes(self) -> int:
-        """Expected size of one image on disk."""
+        """Expected size of one image on disk, bytes."""
         ...
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the config that is written into the dataset; it holds no path."""
+        """Return the configuration as written into the dataset, without any path."""
         ...
 
     def scene_id(self, index: int) -> int:
@@ -46,7 +46,7 @@ class DatasetConfig(Protocol):
         ...
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
-        """Make one image; return it with the background files that could not be decoded."""
+        """Make one image. Return the image as a sample, and the background files that could not be decoded."""
         ...
 
     def __hash__(self) -> int: ...

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from kpbench.types import Detections, UInt8
 
 PATCH_COLOURS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167))
-"""One RGB colour per patch ID, distinct to colour-blind eyes (Okabe and Ito, *Color universal design*, 2008)."""
+"""RGB colours of the patch IDs, distinct to colour-blind eyes (Okabe and Ito, *Color universal design*, 2008)."""
 OUTERMOST_PX = 1e6
-"""Largest coordinate that is drawn, px: OpenCV counts sixteenths of px in 32 bits."""
+"""Largest coordinate that is drawn, px. OpenCV stores coordinates in units of 1/16 px in 32 bits."""
 
 
 def _to_sixteenths(*lengths_px: float) -> tuple[int, ...]:
@@ -50,7 +50,7 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
     if canvas.ndim == 2:
         canvas = cv2.cvtColor(canvas, cv2.COLOR_GRAY2RGB)
     for k in keypoints:
-        # the image's corner stays where it is; it lies half a pixel before the centre of pixel 0
+        # scaling is about the corner of the image, half a pixel left of and above the centre of pixel (0, 0)
         x, y = (float(k["x"]) + 0.5) * scale - 0.5, (float(k["y"]) + 0.5) * scale - 0.5
         major, minor = (float(k["radius_major"]) + 2) * scale, (float(k["radius_minor"]) + 2) * scale
         colour, angle_deg = PATCH_COLOURS[int(k["patch_id"]) % len(PATCH_COLOURS)], float(k["axis_angle"])
@@ -64,7 +64,7 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
 
 
 def draw_detections(image: UInt8, detections: Detections) -> UInt8:
-    """Draw a cross, a ring and the ID of every detection on a copy of an image; larger in larger images.
+    """Draw a cross, a ring and the ID of every detection on a copy of an image. Larger images get larger marks.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def draw_detections(image: UInt8, detections: Detections) -> UInt8:
             continue
         patch_id = None if detections.patch_id is None else int(detections.patch_id[n])
         patch_colour = (255, 0, 0) if patch_id is None else PATCH_COLOURS[patch_id % len(PATCH_COLOURS)]
-        for colour, width in (((0, 0, 0), 3 * unit), (patch_colour, unit)):  # black first: a seam on any ground
+        for colour, width in (((0, 0, 0), 3 * unit), (patch_colour, unit)):  # first a wide black line, as an outline
             cv2.circle(canvas, _to_sixteenths(x, y), 9 * 16 * unit, colour, width, cv2.LINE_AA, 4)
             for dx, dy in ((4 * unit, 0), (0, 4 * unit)):
                 cv2.line(canvas, (round(x - dx), round(y - dy)), (round(x + dx), round(y + dy)), colour, width)

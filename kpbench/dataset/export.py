@@ -1,7 +1,7 @@
 """A dataset in the formats of other tools: COCO keypoints, YOLO-pose, WebDataset.
 
-kpbench and COCO's keypoints measure from the centre of the top-left pixel. Boxes, and all coordinates of YOLO,
-measure from the corner of that pixel, half a pixel further left and up.
+In kpbench and in the keypoints of COCO, the origin is the centre of the top-left pixel. In the boxes of COCO and in all
+coordinates of YOLO, the origin is the top-left corner of this pixel, half a pixel further left and up.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def export_dataset(
     Returns
     -------
     Path
-        The file that names all others: ``annotations.json``, ``data.yaml``, or the first tar.
+        The main file: ``annotations.json``, ``data.yaml``, or the first tar.
 
     Raises
     ------
@@ -68,12 +68,12 @@ def export_dataset(
 
 
 def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
-    """Return the boxes around the projected discs, clipped to the image.
+    """Return the bounding boxes of the projected discs, clipped to the image.
 
     Returns
     -------
     ndarray of shape (n, 4), float64
-        x, y, width and height, px; x and y from the corner of the top-left pixel.
+        x, y, width and height, px. The origin is the top-left corner of the top-left pixel.
     """
     centre, half_size = project_disc_boxes(keypoints["H_patch2image"])
     low = np.clip(centre - half_size + 0.5, 0, [width, height])
@@ -82,7 +82,7 @@ def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
 
 
 def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
-    """Write COCO keypoints: one category per design, each with one keypoint, and kpbench's own columns."""
+    """Write COCO keypoints. Each design is a category with one keypoint. Annotations also hold columns of kpbench."""
     (folder / "images").mkdir()
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -112,14 +112,14 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         {"id": patch_id + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
         for patch_id, name in patch_names(dataset).items()
     ]
-    info = {"description": "kpbench dataset", "fingerprint": dataset.fingerprint}  # `kpbench score` compares it
+    info = {"description": "kpbench dataset", "fingerprint": dataset.fingerprint}  # for `kpbench score`
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
     write_atomic(folder / "annotations.json", json.dumps(content).encode())
     return folder / "annotations.json"
 
 
 def _scoring_groups(dataset: Dataset, n: int) -> dict[str, Any]:
-    """Return the groups of image n for scoring: condition and rung if there are any, and base scene."""
+    """Return the groups of image n for scoring: the base scene, and for a suite the condition and the rung."""
     truth = dataset.truth
     scene = {"scene_id": int(truth.scene_id[n])}
     if not truth.condition[n]:
@@ -153,7 +153,7 @@ def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
 
 
 def _export_webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Path:
-    """Write WebDataset: one tar per shard, with a PNG and a JSON per image; equal datasets give equal bytes."""
+    """Write WebDataset: one tar per shard, with a PNG and a JSON per image. Equal datasets give equal bytes."""
     ids = dataset.truth.image_id
     for number, shard in enumerate(dataset.shards):
         buffer = io.BytesIO()
@@ -172,7 +172,7 @@ def _export_webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Pa
 
 
 def _to_json_numbers(column: NDArray[Any]) -> list[Any]:
-    """Return a column as a list with None (null in JSON) in place of nan, which JSON lacks."""
+    """Return a column as a list with None in place of nan. None becomes null in JSON; JSON has no nan."""
     return [None if value != value else value for value in column.tolist()]
 
 

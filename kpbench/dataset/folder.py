@@ -21,7 +21,7 @@ from kpbench.types import Truth, UInt8
 
 MANIFEST = "dataset.json"
 MOST_OPEN_SHARDS = 128
-"""Most shards that a dataset keeps open; a process may often open no more than 256 files."""
+"""Largest number of shards that a dataset keeps open. Many systems allow a process 256 open files."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def write_manifest(
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:
-    """Return the SHA-256 of every shard as the manifest records it; empty without a readable manifest."""
+    """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
     try:
         shards = json.loads((folder / MANIFEST).read_text("utf-8"))["shards"]
         return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
@@ -88,9 +88,9 @@ def recorded_digests(folder: Path) -> dict[str, str]:
 
 
 class Dataset:
-    """A finished dataset, read lazily; :func:`open_dataset` makes it.
+    """A finished dataset, opened by :func:`open_dataset` and read lazily.
 
-    ``dataset[n]`` is the pair of image n and its true keypoints, so that a torch DataLoader can take the dataset.
+    ``dataset[n]`` is the pair of image n and its true keypoints. A torch DataLoader can load the dataset.
     A dataset can be pickled and used after a fork.
 
     Attributes
@@ -132,14 +132,14 @@ class Dataset:
         return state
 
     def _open(self, n: int) -> Any:
-        """Return the open file of shard n; the shard that was used longest ago is closed when there are too many."""
-        if self._process != os.getpid():  # after a fork: open files belong to the parent
+        """Return the open file of shard n. If too many shards are open, close the least recently used shard."""
+        if self._process != os.getpid():  # after a fork, the open files belong to the parent
             self._files, self._process = {}, os.getpid()
         name = self.shards[n].file
         file = self._files.pop(name, None) or open_shard(self.path / name)
         if len(self._files) == MOST_OPEN_SHARDS:
             self._files.pop(next(iter(self._files))).close()
-        self._files[name] = file  # at the end of the dict: used last
+        self._files[name] = file  # the last file in the dict is the file used last
         return file
 
     def _locate(self, index: int) -> tuple[Any, int, Path]:
@@ -150,7 +150,7 @@ class Dataset:
         return self._open(n), index - self.shards[n].first, self.path / self.shards[n].file
 
     def image(self, index: int) -> UInt8:
-        """Return the image at a position (not image id), (H, W) or (H, W, 3) uint8."""
+        """Return the image at a position, which is not the image ID: (H, W) or (H, W, 3) uint8."""
         file, row, path = self._locate(index)
         with shard_errors(path):
             return np.asarray(file["images"][row])
@@ -172,7 +172,7 @@ class Dataset:
         return self.image(index), self.keypoints(index)
 
     def _read_columns(self, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
-        """Yield whole columns of one shard after the other."""
+        """Yield whole columns, shard by shard."""
         for n, shard in enumerate(self.shards):
             with shard_errors(self.path / shard.file):
                 columns = [self._open(n)[name] for name in names]
@@ -188,7 +188,7 @@ class Dataset:
         return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]), fingerprint=self.fingerprint)
 
     def verify(self) -> Iterator[ShardEntry]:
-        """Check every shard against the manifest; yield each shard that is undamaged.
+        """Check every shard against the manifest. Yield each undamaged shard after its check.
 
         Raises
         ------
@@ -221,7 +221,7 @@ def open_dataset(path: str | Path) -> Dataset:
     Raises
     ------
     DataError
-        If there is no dataset, its run was not finished, or a shard is missing or has the wrong size.
+        If there is no dataset, the dataset is unfinished, or a shard is missing or has the wrong size.
 
     Examples
     --------
@@ -246,7 +246,7 @@ def open_dataset(path: str | Path) -> Dataset:
 
 
 def _read_manifest(folder: Path) -> Dataset:
-    """Return the dataset that the manifest of a folder describes; its shards are not looked at."""
+    """Return the dataset that the manifest of a folder describes. The shards are not checked."""
     manifest = folder / MANIFEST
     try:
         content = json.loads(manifest.read_text("utf-8"))

@@ -1,8 +1,8 @@
-"""Making datasets: plan the shards, keep those that are finished, make the others, write the manifest last.
+"""Making datasets: plan the shards, keep finished shards, make the missing shards, write the manifest last.
 
-A shard is a function of the configuration and of the shard's place in the dataset. So it does not matter which
-process makes a shard, when, and in which run. For the same reason an interrupted run can be resumed, and parts
-that were made on several machines can be merged.
+A shard is a function of the configuration and of the shard's place in the dataset. Any process can therefore make a
+shard, at any time and in any run. An interrupted run can be resumed. Parts that were made on several machines can be
+merged.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class GenerationResult:
     ----------
     dataset : Dataset
     broken_files : tuple of str
-        Background files that could not be decoded; other files were taken in their place.
+        Background files that could not be decoded. Other files were used instead.
     kept : int
-        Number of images that an earlier run had made.
+        Number of images kept from an earlier run.
 
     Examples
     --------
@@ -82,14 +82,15 @@ def generate(
 
     Parameters
     ----------
-    config : SynthConfig or SuiteConfig
-        Or any other :class:`kpbench.dataset.DatasetConfig`.
+    config : DatasetConfig
+        Such as :class:`kpbench.SynthConfig` or :class:`kpbench.SuiteConfig`.
     out : str or Path
-        Folder; made if missing. Or a URL that fsspec reaches, such as ``s3://bucket/name``.
+        Folder, or a URL that fsspec reaches, such as ``s3://bucket/name``. A missing folder is made.
     workers : int or None
         Number of worker processes, None for one per core. With 1, this process makes all shards.
     executor : concurrent.futures.Executor, optional
-        Makes the shards in place of worker processes. The folder and the backgrounds must have the same paths there.
+        Executor that makes the shards instead of worker processes. The workers of the executor must find the folder and
+        the backgrounds under the same paths.
     scheduler : str, optional
         Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers make the shards.
     resume : bool
@@ -139,7 +140,9 @@ def generate_part(
     overwrite: bool = False,
     progress: Progress = lambda images: None,
 ) -> int:
-    """Make some shards of a dataset and no manifest. Several such runs may share a folder; see :func:`merge`.
+    """Make some shards of a dataset, without a manifest.
+
+    Several runs may make different shards in the same folder. :func:`merge` then makes the dataset.
 
     Parameters
     ----------
@@ -151,12 +154,12 @@ def generate_part(
     Returns
     -------
     int
-        Number of finished images in these shards.
+        Number of images in these shards, kept images included.
 
     Raises
     ------
     DataError
-        As :func:`generate`; or if the dataset has no such shards.
+        If the dataset does not have these shards, and in all cases of :func:`generate`.
 
     Examples
     --------
@@ -183,7 +186,7 @@ def generate_part(
 
 
 def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
-    """Make one dataset of shards that were made in parts.
+    """Make one dataset from shards that several runs made.
 
     Parameters
     ----------
@@ -199,7 +202,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     Raises
     ------
     DataError
-        If a shard is missing, damaged, or of another dataset than the first shard.
+        If a shard is missing, is damaged, or belongs to another dataset than the first shard.
 
     Examples
     --------
@@ -231,7 +234,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
 
 
 def _link_or_copy(source: Path, target: Path) -> None:
-    """Make a hard link to a file, or a copy of the file where the file system has no hard links."""
+    """Make a hard link to a file. Copy the file if the link fails."""
     try:
         os.link(source, target)
     except OSError:
@@ -239,7 +242,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
 
 
 def _open_executor(executor: Executor | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
-    """Connect to a Dask scheduler if there is an address; otherwise pass the executor on."""
+    """Connect to the Dask scheduler if an address is given. Otherwise, pass the executor on."""
     return nullcontext(executor) if scheduler is None else dask_executor(scheduler)
 
 
@@ -269,7 +272,7 @@ class _Run:
 
 
 def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str, FinishedShard]:
-    """Make the planned shards that are not kept; return all planned shards by their file names."""
+    """Make the planned shards that are not kept. Return all planned shards by their file names."""
     missing = [shard for shard in run.plan if shard.file not in kept]
     # shards of the same scenes follow each other, so that cached backgrounds are used again
     missing.sort(key=lambda shard: run.config.scene_id(shard.first))
@@ -324,7 +327,7 @@ def _format_bytes(count: float) -> str:
 
 
 def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:
-    """Return the versions that can change pixels, and the broken files; equal runs give equal provenance."""
+    """Return the versions of software that can change pixels, and the broken files, equal for equal runs."""
     libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "deflate")
     return {
         "versions": {
@@ -362,5 +365,5 @@ def _make_shard(
 
 @cache
 def _config_of_process(config: DatasetConfig) -> DatasetConfig:
-    """Return one config object per process, so that all shards share its cache of decoded photographs."""
+    """Return one config object per process. All shards then share the object's cache of decoded photographs."""
     return config

@@ -19,7 +19,7 @@ from kpbench.files import is_local, sha256_of
 
 LOCK_FILE = ".kpbench.lock"
 LONGEST_VALUE = 40
-"""Longest text of a config's value that an error message shows."""
+"""An error message shows the values of a config only if their texts are shorter than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
 """What a user can do about a folder that holds another dataset."""
 
@@ -79,8 +79,8 @@ def prepare_folder(
     Raises
     ------
     DataError
-        If the folder holds other files; if it holds shards and neither ``resume`` nor ``overwrite`` is set; or as
-        :func:`find_finished_shards`.
+        If the folder holds files that are not of a dataset. If the folder holds a dataset or planned shards, and
+        neither ``resume`` nor ``overwrite`` is set. If :func:`find_finished_shards` raises the error.
     """
     manifest, names = folder / MANIFEST, {shard.file for shard in plan}
     entries = [path for path in folder.glob("*") if not path.name.startswith(".")]
@@ -98,7 +98,7 @@ def prepare_folder(
         remedy = "add `resume=True` to finish it, `overwrite=True` to replace it, or another `out`"
         raise DataError(f"{folder}: {problem}; {remedy}")
     for name in names:
-        for leftover in folder.glob(f".{name}.*.part"):  # of a run that was killed while it wrote
+        for leftover in folder.glob(f".{name}.*.part"):  # from a run that was killed while writing
             leftover.unlink(missing_ok=True)
     if overwrite or not resume:
         return {}
@@ -111,7 +111,7 @@ def prepare_folder(
 def find_finished_shards(
     folder: Path, config: dict[str, Any], plan: Sequence[PlannedShard], remedy: str = ""
 ) -> dict[str, FinishedShard]:
-    """Find the shards of a plan that are in a folder, and check each.
+    """Find the planned shards that a folder holds, and check each of these shards.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def find_finished_shards(
         Config of the dataset.
     plan : sequence of PlannedShard
     remedy : str
-        End of the message about a shard of another dataset.
+        Text to append to the message about a shard of another dataset.
 
     Returns
     -------
@@ -159,7 +159,10 @@ def read_shard_head(path: Path) -> ShardHead:
 
 
 def first_difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
-    """Describe the first key whose value differs between two configs, "" if none does; tables are entered."""
+    """Describe the first key whose value differs between two configs. Return "" if the configs agree.
+
+    If the value is a table in both configs, the first different key of the table is described.
+    """
     for key in expected:
         if found.get(key) != expected[key]:
             if isinstance(found.get(key), dict) and isinstance(expected[key], dict):
@@ -201,7 +204,7 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     folder : Path
         A folder at a URL is not locked: object stores have no locks.
     shared : bool
-        Let other runs with a shared lock write at the same time, each its own shards.
+        Allow other runs with a shared lock at the same time. Each run must write other shards.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Shards: HDF5 files that hold some images of a dataset and their truth, written whole and checked on reading.
+"""Shards: HDF5 files that hold some images of a dataset and their true keypoints. Opening a shard checks the file.
 
 ``docs/reference/dataset-format.md`` describes the format.
 """
@@ -24,9 +24,9 @@ from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
-"""Level of libdeflate. The output of ISA-L, zlib-ng and zlib-rs may depend on what else is in memory."""
+"""Level of libdeflate. Unlike libdeflate, ISA-L, zlib-ng and zlib-rs may give different bytes for the same input."""
 MOST_INFLATION = 1100
-"""Largest believable ratio of unpacked to packed bytes; deflate reaches 1032 at most."""
+"""Largest accepted ratio of unpacked to packed bytes. Deflate reaches at most 1032."""
 SHARD_COLUMNS = (
     "images",
     "image_id",
@@ -59,7 +59,7 @@ class Sample:
     rung : float
         nan if the image belongs to no condition.
     scene_id : int
-        The base scene; images of one scene share it. -1 if the image is a scene of its own.
+        ID of the base scene, the same for all images of the scene. -1 if the image is a scene of its own.
 
     Examples
     --------
@@ -88,9 +88,9 @@ def canonical_json(content: object) -> str:
 def encode_shard(
     samples: Iterable[Sample], count: int, config: Mapping[str, Any], broken_files: Collection[str] = ()
 ) -> memoryview:
-    """Build a shard in memory and return its bytes; the same samples give the same bytes.
+    """Build a shard in memory and return its bytes. The same samples give the same bytes.
 
-    Each image is packed as soon as it is made, so that only one image at a time is in memory unpacked.
+    Each image is compressed as soon as it is made. At most one uncompressed image is in memory.
 
     Parameters
     ----------
@@ -100,8 +100,8 @@ def encode_shard(
     config : mapping
         Config of the dataset.
     broken_files : collection of str
-        Background files that could not be decoded. It is read after the last sample, so the making of samples may
-        still add to it.
+        Background files that could not be decoded. The collection is read after the last sample. The iterator over
+        the samples may therefore still add files.
 
     Raises
     ------
@@ -109,11 +109,11 @@ def encode_shard(
         If there are no samples, or their images differ in shape.
     """
     buffer = io.BytesIO()
-    # File structures of v110 carry checksums, so that reading finds a flipped byte outside the data, too. Only the
-    # heap of variable-length strings has no checksum, and HDF5 can loop for ever over a damaged heap: text is
-    # therefore stored in fixed length.
-    # Without a chunk cache, a column gets its place in the file when it is written. With a cache, it gets its place
-    # when Python frees the h5py object, which garbage collection in another thread can delay.
+    # File structures of v110 carry checksums, so that reading also finds a flipped byte outside the data. Only the heap
+    # of variable-length strings has no checksum, and HDF5 can loop for ever over a damaged heap. Text is therefore
+    # stored in fixed length.
+    # Without a chunk cache, a column gets its place in the file when the column is written. With a cache, the column
+    # would get its place when Python frees the h5py object, at a time that depends on other threads.
     with h5py.File(buffer, "w", libver=("v110", "v110"), rdcc_nbytes=0) as file:
         written = _write_images(file, samples, count)
         attributes = {
@@ -144,7 +144,7 @@ def encode_shard(
 
 
 def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Sample]:
-    """Write ``/images``, one image per chunk; return the samples without their pixels."""
+    """Write ``/images``, one image per chunk. Return the samples without their pixels."""
     written: list[Sample] = []
     shape: tuple[int, ...] = ()
     for sample in samples:
@@ -163,7 +163,7 @@ def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Samp
 
 
 def _fixed_text_type(encoded: Sequence[bytes]) -> Any:
-    """Return HDF5's type of UTF-8 text of the length of the longest text."""
+    """Return HDF5's type for UTF-8 text of a fixed length. The length is that of the longest text."""
     return h5py.string_dtype("utf-8", max(len(text) for text in [b"-", *encoded]))
 
 
@@ -178,7 +178,7 @@ def _scene_id(sample: Sample) -> int:
 
 @contextmanager
 def shard_errors(path: Path) -> Iterator[None]:
-    """Turn every error of h5py on a damaged file into one line that names the file."""
+    """Turn every error of h5py on a damaged file into a DataError of one line that names the file."""
     try:
         yield
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
@@ -191,7 +191,7 @@ def read_text_attribute(file: Any, name: str) -> str:
 
 
 def open_shard(path: Path) -> Any:
-    """Open a shard after checking that it is plain local data of believable size.
+    """Open a shard. Check that all data lie in the file itself and have a plausible size.
 
     Returns
     -------
@@ -200,8 +200,8 @@ def open_shard(path: Path) -> Any:
     Raises
     ------
     DataError
-        If the file is damaged, has another schema, or needs anything outside itself: external links or storage,
-        virtual datasets, filters that are not built into HDF5.
+        If the file is damaged or has another schema. If the file needs external links, external storage, virtual
+        datasets, or filters that are not built into HDF5.
     """
     with shard_errors(path):
         file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
@@ -215,7 +215,7 @@ def open_shard(path: Path) -> Any:
 
 
 def _check_shard(file: Any, file_bytes: int) -> None:
-    """Raise ValueError if an open shard is not what :func:`open_shard` accepts."""
+    """Raise ValueError if :func:`open_shard` must refuse an open shard."""
     schema = read_text_attribute(file, "schema")
     if schema != DATASET_SCHEMA:
         raise ValueError(f"schema is {schema!r}, expected {DATASET_SCHEMA!r}")
@@ -237,7 +237,7 @@ def _check_shard(file: Any, file_bytes: int) -> None:
 
 
 def _check_storage(file: Any, name: str, file_bytes: int) -> None:
-    """Raise ValueError if a column is stored elsewhere, or declares more data than its bytes can hold."""
+    """Raise ValueError if a column is stored outside the file, or declares more data than its bytes can hold."""
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
         raise ValueError(f"/{name} is missing or a link to elsewhere")
     data = file[name]
@@ -254,5 +254,5 @@ def _check_storage(file: Any, name: str, file_bytes: int) -> None:
 
 
 def encode_utf8(text: str) -> bytes:
-    """Encode text as UTF-8; bytes of file names that are no text are escaped as in JSON."""
+    """Encode text as UTF-8. Bytes of file names that are not valid text are escaped as in JSON."""
     return text.encode(errors="backslashreplace")

@@ -1,7 +1,7 @@
 """Frames, homographies, a camera, exact outlines and the area that outlines cover.
 
-Conventions of all rooms
-------------------------
+Conventions of the whole package
+--------------------------------
 * Image frame: px, x right, y down. The centre of the top-left pixel is (0, 0), as in OpenCV.
 * Patch frame: the patch is the unit disc, u right, v down. Angles grow from +u towards +v.
 * Board frame: mm, x right, y down, z away from the viewer. The origin is the board's centre.

@@ -31,11 +31,13 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 class Camera:
     """A camera whose principal point is the centre of the image.
 
-    A point at (x, y, z) of the camera frame has the ray (x / z, y / z). :meth:`distort` maps rays to px by the model of
-    Brown (1966) in OpenCV's form, with ``r² = x² + y²``::
+    A point (X, Y, Z) of the camera frame has the ray (x, y) = (X / Z, Y / Z). :meth:`distort` applies the model of
+    Brown (1966) in OpenCV's form to the ray, with ``r² = x² + y²``::
 
         x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
         y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
+
+    The intrinsic matrix :attr:`K` then maps (x', y') to px.
 
     Attributes
     ----------
@@ -44,7 +46,7 @@ class Camera:
     focal_px : float
         Focal length in px.
     distortion : tuple of 5 float
-        OpenCV's (k1, k2, p1, p2, k3). All zero for a pinhole camera.
+        OpenCV's (k1, k2, p1, p2, k3). All are zero for a camera without distortion.
 
     Examples
     --------
@@ -67,12 +69,12 @@ class Camera:
         return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
 
     def project(self, points_camera: ArrayLike) -> Float:
-        """Return the px, shape (N, 2), of points of the camera frame, shape (N, 3), z > 0."""
+        """Return the image points in px, shape (N, 2), of points of the camera frame, shape (N, 3), z > 0."""
         points = np.asarray(points_camera, np.float64)
         return self.distort(points[:, :2] / points[:, 2:])
 
     def distort(self, rays: Float) -> Float:
-        """Return the px, shape (N, 2), of rays (x / z, y / z), shape (N, 2)."""
+        """Return the image points in px, shape (N, 2), of rays (x, y), shape (N, 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(rays, np.float64).T
         r2 = x * x + y * y
@@ -82,9 +84,9 @@ class Camera:
         return np.asarray(self.focal_px * np.column_stack([xd, yd]) + self.K[:2, 2])
 
     def local_K(self, ray: ArrayLike) -> Float:
-        """Return the intrinsic matrix, shape (3, 3), that equals :meth:`distort` to first order near one ray.
+        """Return the matrix, shape (3, 3), that equals :meth:`distort` to first order near one ray.
 
-        The matrix is ``K`` at every ray if the camera has no distortion.
+        If the camera has no distortion, the matrix is ``K`` for every ray.
         """
         k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(ray, np.float64)

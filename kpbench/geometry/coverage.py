@@ -2,11 +2,12 @@
 
 Each pixel gets the area of the polygon within the pixel, without sampling. The algorithm:
 
-1. Cut every edge where the edge crosses a pixel border.
-2. Let each piece add its signed area to its own pixel, and its height to the pixel on the right.
-3. Sum along the rows. The sum carries the height of each piece to all pixels on the right of the piece.
+1. Cut every edge into pieces at the pixel borders.
+2. For each piece, add the signed area right of the piece to its own pixel, and the rest of the height of the piece to
+   the pixel on the right.
+3. Sum along the rows. The sum carries the height of each piece to all pixels right of the piece.
 
-The cost grows with the length of the outline, not with its area.
+The cost of steps 1 and 2 grows with the length of the outline, not with the area inside.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ Box = tuple[int, int, int, int]
 
 
 def bounding_box(polygons: Sequence[Float]) -> Box:
-    """Return the smallest box that :func:`rasterise` accepts for these polygons, one pixel of margin included.
+    """Return the smallest box that :func:`rasterise` accepts for the polygons, with a margin of one pixel.
 
     Parameters
     ----------
@@ -50,13 +51,13 @@ def bounding_box(polygons: Sequence[Float]) -> Box:
 
 
 def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[Float]:
-    """Return the fraction of each pixel that a region covers, for several regions in boxes of their own.
+    """Return the covered fraction of each pixel, for several regions, each in its own box.
 
     Parameters
     ----------
     regions : sequence of sequences of ndarray of shape (N, 2)
-        Polygons of each region, in px. The centres of pixels are at whole numbers. Within a region, holes run in the
-        direction opposite to the outer borders. The outer borders may run in either direction.
+        Polygons of each region, in px. The centres of pixels are at whole numbers. Within a region, the polygons of
+        holes run in the direction opposite to the outer polygons. The outer polygons may run in either direction.
     boxes : sequence of (int, int, int, int)
         x, y, width and height of one box per region. The box contains the region's :func:`bounding_box`.
 
@@ -80,19 +81,19 @@ def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[
     owner = np.repeat(np.arange(len(regions)), [sum(map(len, region)) for region in regions])
     if not len(owner):
         return [np.zeros((h, w)) for _, _, w, h in boxes]
-    ends = [np.concatenate([polygon[1:], polygon[:1]]) for polygon in polygons]  # a fifth of np.roll's time
+    ends = [np.concatenate([polygon[1:], polygon[:1]]) for polygon in polygons]  # takes a fifth of the time of np.roll
     return rasterise_edges(np.concatenate(polygons).T, np.concatenate(ends).T, owner, boxes)
 
 
 def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
-    """Return what :func:`rasterise` returns, for regions that are given by their edges.
+    """Return the covered fractions as :func:`rasterise` does, for regions given by their edges.
 
     Parameters
     ----------
     start, end : ndarray of shape (2, N), float64
         First and last point of each edge in px; the rows are x and y.
     owner : ndarray of shape (N,), int64
-        Index into ``boxes`` of the region that each edge belongs to. The edges of a region form closed polygons.
+        Index of each edge's region, and of the region's box in ``boxes``. The edges of a region form closed polygons.
     boxes : sequence of (int, int, int, int)
         As in :func:`rasterise`.
     """
@@ -100,7 +101,7 @@ def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: S
     base = np.concatenate([[0], np.cumsum(width * height)])
     corner = np.stack([x - 0.5, y - 0.5])[:, owner]
     signed = _accumulate(start - corner, end - corner, base[owner], width[owner], int(base[-1]))
-    # the sum over a region is zero, so a single running sum serves all regions; abs, as borders run in either direction
+    # the sum over a region is zero, so a single running sum serves all regions; abs, as outer polygons run either way
     covered = np.cumsum(signed)
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
     return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
@@ -109,10 +110,10 @@ def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: S
 def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDArray[np.int64], total: int) -> Float:
     """Return an array whose running sum along the rows is the signed coverage.
 
-    The edges are in pixels of their box, where pixel i spans [i, i + 1).
+    Edges are in px of the frame of their box, in which pixel i spans [i, i + 1).
     """
     step = end - start
-    # divide edges into parts shorter than a pixel: a part crosses at most one vertical and one horizontal border
+    # divide edges into parts shorter than a pixel: a part crosses at most one vertical and one horizontal pixel border
     parts = np.maximum(np.abs(step[0]), np.abs(step[1])).astype(np.int64) + 1
     edge_of_part = np.repeat(np.arange(len(parts)), parts)
     if len(edge_of_part) > len(parts):
@@ -140,7 +141,7 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
 
 
 def clip_to_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the slices of the image, and those of the box, for the part of a box that lies in the image."""
+    """Return the slices into the image and the slices into a box for the part of the box inside the image."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
     x1, y1 = max(x0, x1), max(y0, y1)

@@ -1,4 +1,4 @@
-"""Homographies, the ellipses that discs become under them, and *the* pixel convention.
+"""Homographies, the projection of discs to ellipses, and the pixel convention of the whole package.
 
 Conventions
 -----------
@@ -52,7 +52,7 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
 
 @dataclass(frozen=True)
 class Ellipse:
-    """An ellipse: centre and semi-axes in px, angle of the major axis from +x towards +y in [0, 180) degrees."""
+    """An ellipse: centre and semi-axes in px; angle of the major axis in [0, 180) degrees, from +x towards +y."""
 
     x: float
     y: float
@@ -62,11 +62,11 @@ class Ellipse:
 
 
 def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
-    """Return the ellipses that the unit circle becomes under many homographies.
+    """Return the ellipses to which homographies map the unit circle.
 
     The dual conic of the unit circle is ``C* = diag(1, 1, -1)``. Its image under H is ``H C* Hᵀ`` (Hartley and
-    Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). The centre of the ellipse is *not* the image of the disc's
-    centre, unless H is affine.
+    Zisserman, *Multiple View Geometry*, 2nd ed., eq. 2.17). The centre of the ellipse is the image of the disc's centre
+    only if H is affine.
 
     Parameters
     ----------
@@ -80,11 +80,12 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     major, minor : ndarray of shape (N,)
         Semi-axes, px.
     angle_deg : ndarray of shape (N,)
-        Angles of the major axes from +x towards +y, in [0, 180).
+        Angles of the major axes from +x towards +y, in [0, 180) degrees.
 
     Notes
     -----
-    All four are nan where the disc touches or crosses the camera's horizon. Its image is then no ellipse.
+    All values of a disc are nan if the disc touches or crosses the camera's horizon. The image of the disc is then no
+    ellipse.
 
     Examples
     --------
@@ -105,7 +106,7 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
 
 
 def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
-    """Return the boxes around the ellipses of :func:`project_discs`.
+    """Return the bounding boxes of the ellipses of :func:`project_discs`.
 
     Parameters
     ----------
@@ -125,19 +126,19 @@ def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
 
 
 def _project_dual_conics(H_patch2image: Float) -> Float:
-    """Return the dual conic of the unit circle under many homographies, scaled to 1 in the last entry."""
+    """Return the images of the unit circle's dual conic under homographies, each divided by its last entry."""
     dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan))
 
 
 def project_disc(H_patch2image: Float) -> Ellipse:
-    """Return the ellipse that the unit circle becomes under one homography, see :func:`project_discs`.
+    """Return the ellipse to which a homography maps the unit circle. See :func:`project_discs`.
 
     Raises
     ------
     ValueError
-        If the disc touches or crosses the camera's horizon. Its image is then no ellipse.
+        If the disc touches or crosses the camera's horizon. The image of the disc is then no ellipse.
     """
     centre, major, minor, angle_deg = project_discs(H_patch2image[None])
     if np.isnan(major[0]):

@@ -1,11 +1,9 @@
 """Outlines of exact straight lines and circular arcs, in any planar frame.
 
 * A *segment* is a :class:`Line` or an :class:`Arc`.
-* A *contour* is a closed tuple of segments. Each segment starts where the segment before it ends.
+* A *contour* is a closed tuple of segments. Each segment starts where the previous segment ends.
 * A *region* is a tuple of contours. Points of the region have winding number 1. The contours of holes therefore run in
   the direction opposite to the outer contours.
-
-Outlines do not depend on the format in which they will be drawn.
 """
 
 from __future__ import annotations
@@ -48,7 +46,7 @@ class Arc:
     start_deg : float
         Direction of the first point, from +x towards +y.
     sweep_deg : float
-        Angle that the arc covers, positive from +x towards +y, from -360 to 360.
+        Angle that the arc covers, from -360 to 360, positive from +x towards +y.
 
     Examples
     --------
@@ -119,7 +117,7 @@ def rectangle(x: float, y: float, width: float, height: float) -> Region:
 
 
 def move(region: Region, x: float, y: float, scale: float = 1.0, rotate_deg: float = 0.0) -> Region:
-    """Return a region scaled about the origin, then rotated about the origin, then shifted.
+    """Return a region that is scaled about the origin, then rotated about the origin, then shifted.
 
     Parameters
     ----------
@@ -152,8 +150,8 @@ def move(region: Region, x: float, y: float, scale: float = 1.0, rotate_deg: flo
 def flatten(region: Region, tolerance: float) -> list[Float]:
     """Approximate every contour by a closed polygon.
 
-    Arcs become chords that enclose the same area as the arc, see :func:`arc_vertices`. The distance between chords and
-    arc is at most ``tolerance``. The mean of the distance along the arc is zero.
+    Each arc becomes chords that enclose the same area as the arc, see :func:`arc_vertices`. The distance between the
+    chords and the arc is at most ``tolerance``. The mean signed distance along the arc is zero to first order.
 
     Parameters
     ----------
@@ -179,8 +177,8 @@ def flatten(region: Region, tolerance: float) -> list[Float]:
 def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
     """Return the vertices of chords that enclose the same area as an arc.
 
-    The vertices lie outside the circle by the factor ``sqrt(step / sin(step))``. The triangle between two
-    neighbours and the centre then has the area of the sector, ``radius ** 2 * step / 2``.
+    The distance of the vertices from the centre is ``radius * sqrt(step / sin(step))``. The triangle of two neighbours
+    and the centre then has the area of the sector, ``radius ** 2 * step / 2``.
 
     Parameters
     ----------
@@ -200,7 +198,7 @@ def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
 
 
 def _vertices(part: Line | Arc, tolerance: float) -> Float:
-    """Return the vertices of one segment without its last point, with which the next segment starts."""
+    """Return the vertices of one segment without its last point, which is the first point of the next segment."""
     if isinstance(part, Line):
         return np.array([[part.x0, part.y0]])
     # a chord over the angle 2h is up to r (1 - cos h) ~ r h² / 2 off the arc; equal areas halve this distance

@@ -19,13 +19,16 @@ from kpbench.geometry.outline import cos_sin_deg
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float
 
-HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side: the paper's 16-px patch on 0.5 % of the image
+# 16 px, as in the paper, if the board fills 0.5 % of the image
+HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
-TOUCHING_MM = 1e-6  # patches may overlap by this much, so that rounding does not part patches that touch
+TOUCHING_MM = 1e-6  # allowed overlap: rounding errors must not turn patches that touch into an error
 
 
 class BoardPoint(Protocol):
-    """A point on a board, with the disc that gives the point its scale. A patch fills the disc.
+    """A keypoint of a board, with the disc that sets the scale of the keypoint.
+
+    On a board of patches, the disc is the patch without rim and quiet zone.
 
     Examples
     --------
@@ -69,7 +72,7 @@ class BoardLike(Protocol):
 
     @property
     def keypoints(self) -> Sequence[BoardPoint]:
-        """Points in the order in which the truth lists them."""
+        """Keypoints, in the order of the ground truth."""
         ...
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
@@ -193,18 +196,19 @@ class Board:
         Parameters
         ----------
         radius_px : ndarray of shape (n,)
-            Radius of each keypoint's disc in the image. Polygons deviate from curves by at most 1/1000 px there.
+            Radius of each keypoint's disc in the image, px. In the image, the polygons deviate from the exact curves by
+            at most 1/1000 px.
 
         Returns
         -------
         parts : list of lists of ndarray of shape (N, 2)
-            Polygons of each part of the ink. Parts do not overlap; here, each patch is a part.
+            Polygons of each part of the ink. Each patch is one part. Parts do not overlap.
         discs : list of lists of ndarray of shape (N, 2)
             Polygons of each keypoint's disc, rim and quiet zone included.
         """
         parts, discs = [], []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
-            # powers of two are few: the cache of unit_polygons then serves many radii
+            # the tolerance is rounded down to a power of two, so that similar radii share an entry of the cache
             black, disc = unit_polygons(k.patch, 2.0 ** np.floor(np.log2(1e-3 / radius)))
             parts.append([project(k.H_patch2board, polygon) for polygon in black])
             discs.append([project(k.H_patch2board, polygon) for polygon in disc])
@@ -212,7 +216,7 @@ class Board:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the designs and their places, rounded to 1 nm; the name of the board does not count."""
+        """SHA-256 of the size of the board, its designs and their places, rounded to 1 nm. Names are not hashed."""
         lengths: list[tuple[float, ...]] = [(self.side_x_mm, self.side_y_mm)]
         lengths += [(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints]
         patches = [(k.patch.patch_id, k.patch.digest) for k in self.keypoints]
@@ -255,8 +259,8 @@ def grid_board(
 ) -> Board:
     """Return a board with patches in rows and columns, listed row by row from the top left.
 
-    The patch in row r and column c is design ``(r + c) % len(patches)``. Neighbours therefore differ. The board is
-    ``columns * pitch_mm`` wide and ``rows * pitch_mm`` high.
+    The patch in row r and column c is ``patches[(r + c) % len(patches)]``. With two or more designs, neighbours
+    therefore differ. The board is ``columns * pitch_mm`` wide and ``rows * pitch_mm`` high.
 
     Parameters
     ----------
@@ -271,7 +275,7 @@ def grid_board(
     Raises
     ------
     DesignError
-        If patches overlap.
+        If patches overlap or leave the board, or two different designs share an id.
 
     Examples
     --------

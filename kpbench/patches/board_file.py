@@ -12,7 +12,7 @@ from kpbench.patches.design import Patch, load_patches, shipped_patches
 from kpbench.toml import TomlTable, name_source, read_toml
 
 BOARD_FILE_SCHEMA = "kpbench.board-design/1"
-GRID_PITCH = 2.0  # distance of neighbours in a grid whose file names no pitch, in disc diameters
+GRID_PITCH = 2.0  # default pitch of a grid, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
 BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
 GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
@@ -22,18 +22,18 @@ PLACE_MM = (-25_000.0, 25_000.0)  # least and greatest coordinate in a file
 
 
 def find_patch(patches: Sequence[Patch], key: object) -> Patch:
-    """Return the design with a name or an id.
+    """Return the design that has a given name or id.
 
     Parameters
     ----------
     patches : sequence of Patch
     key : str or int
-        Name, or id as a number or as a text.
+        Name or id. The id may be a number or a string.
 
     Raises
     ------
     DesignError
-        If no design has this name or id, or if two designs have this name.
+        If no design, or more than one design, has this name or id.
 
     Examples
     --------
@@ -49,16 +49,16 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
 
 
 def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
-    """Read a board from a TOML file with either a ``[grid]`` or a list of ``[[keypoint]]``.
+    """Read a board from a TOML file that has either one ``[grid]`` or ``[[keypoint]]`` entries.
 
     Parameters
     ----------
     path : str or Path
     patches : sequence of Patch, optional
-        Designs that the file may name. If left out: the designs that the file lists under ``designs`` (paths relative
-        to the file), or else the shipped designs.
+        Designs that the file may name. Default: the designs under ``designs`` in the file, or the shipped designs if
+        the file has no ``designs``. Paths under ``designs`` are relative to the file.
     diameter_mm : float, optional
-        Diameter of discs for which the file sets none; 30 if left out.
+        Diameter of each disc whose diameter is not set in the file. Default: 30.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
 def parse_board(
     content: Mapping[str, Any], path: Path, patches: Sequence[Patch] | None, diameter_mm: float | None
 ) -> Board:
-    """Return the board that the content of a TOML file describes, see :func:`load_board`."""
+    """Return the board that the content of a TOML file describes. See :func:`load_board`."""
     table = TomlTable(content, BOARD_KEYS, DesignError)
     table.require_schema(BOARD_FILE_SCHEMA, optional=True)
     if "designs" in table:
@@ -92,7 +92,7 @@ def parse_board(
         if not all(isinstance(file, str) for file in files):
             raise table.problem("designs", "a list of file names")
         if patches is not None:
-            raise DesignError("designs is set in the file, and others were given; drop one of them")
+            raise DesignError("designs is set in the file, and other designs were given; drop one of them")
         patches = load_patches([path.parent / file for file in files])
     elif patches is None:
         patches = shipped_patches()

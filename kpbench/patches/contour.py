@@ -1,7 +1,8 @@
 """Outline of a design's black cells, as exact contours of straight lines and arcs.
 
-A design is a polar chequer of rings and sectors, see :class:`kpbench.patches.Patch`. A *node* is a pair (ring border,
-sector border). All nodes at radius 0 are one node, the centre. A *border* of a cell leads from node to node.
+A design is a polar chequer of rings and sectors, see :class:`kpbench.patches.Patch`. A *node* is a pair of indices
+(radius, angle). All nodes at radius 0 are one node, the centre. A *border* of a cell is a line or an arc from one node
+to the next node.
 """
 
 from __future__ import annotations
@@ -14,26 +15,26 @@ from kpbench.types import Float
 
 Node = tuple[int, int]
 Border = tuple[Node, Node, str]
-"""First node, last node, and a name such as ``line0,3`` or ``arc1,2`` that tells borders between equal nodes apart."""
+"""First node, last node, and a name such as ``line0,3`` or ``arc1,2``. Borders of the same nodes differ in name."""
 
 
 def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Region:
-    """Return the contours of the black cells: the borders of all cells without those that two black cells share.
+    """Return the contours of the black cells, without the borders that two black cells share.
 
     Parameters
     ----------
     radii : ndarray of shape (R + 1,)
-        Borders of the rings, ascending from 0.
+        Radii between which the rings lie, ascending from 0.
     angles : ndarray of shape (A,)
-        Borders of the sectors in degrees, ascending in [0, 360).
+        Angles between which the sectors lie, in degrees, ascending in [0, 360).
     black : ndarray of shape (R, A), bool
-        Ink of each cell.
+        Whether each cell is black.
     """
     rings, sectors = black.shape
     width = np.diff(np.append(angles, angles[0] + 360.0))
-    # The borders of a cell run around the cell in one direction. Two black neighbours therefore give their common
-    # border once in each direction, and both borders cancel.
-    borders: dict[Border, float] = {}  # to the sweep of an arc in degrees, 0 for a line
+    # The borders of every cell run around the cell in the same direction. Two black neighbours therefore add their
+    # common border in opposite directions, and the two additions cancel.
+    borders: dict[Border, float] = {}  # the value is the sweep of an arc in degrees, 0 for a line
 
     def add(start: Node, end: Node, kind: str, sweep: float) -> None:
         a = (start[0], 0) if start[0] == 0 else start
@@ -64,7 +65,7 @@ def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Reg
 
 
 def _chain(borders: dict[Border, float], radii: Float, angles: Float) -> Region:
-    """Join borders into closed contours: each border starts where the border before it ends."""
+    """Join borders into closed contours: each border starts where the previous border ends."""
     leaving: dict[Node, list[Border]] = {}
     for border in borders:
         leaving.setdefault(border[0], []).append(border)
@@ -86,11 +87,12 @@ def _chain(borders: dict[Border, float], radii: Float, angles: Float) -> Region:
 
 
 def _next_border(arriving: Border, choices: list[Border], angles: Float) -> int:
-    """Return the index of the border that belongs to the same cell, where black cells touch at a point.
+    """Return the index of the border that continues the arriving border around the same ink.
 
-    Outside the centre, a cell turns from a line to an arc or from an arc to a line. At the centre, the ink lies
-    clockwise of a leaving line and anticlockwise of an arriving line. The line that leaves along the same sector is
-    therefore the nearest line anticlockwise of the arriving line.
+    Several borders leave a node where black cells touch at a point only. Outside the centre, the contour of a cell
+    turns there from a line to an arc, or from an arc to a line. At the centre, the ink lies anticlockwise of the
+    arriving line and clockwise of a leaving line. The line that leaves around the same ink is therefore the nearest
+    line anticlockwise of the arriving line.
     """
     if arriving[1][0] != 0 or len(choices) == 1:
         return next((n for n, c in enumerate(choices) if c[2][:3] != arriving[2][:3]), 0)

@@ -1,8 +1,9 @@
 """Designs of patches: read from TOML, and turned into exact outlines.
 
-A patch is a disc of radius 1 with one ink. Semi-circles about the same centre are painted onto the disc one after the
-other. A semi-circle is black, white, or inverts the ink below. The result is always a polar chequer
-(:attr:`Patch.cells`): rings between the radii, sectors between the angles, and each cell is black or white.
+A patch starts as a disc of radius 1 in a single ink. Semi-circles about the disc's centre are painted onto the disc in
+order. A semi-circle is black, or white, or inverts the ink below. The result is always a polar chequer
+(:attr:`Patch.cells`). Radii divide the chequer into rings, and angles divide the chequer into sectors. Each cell is
+black or white.
 """
 
 from __future__ import annotations
@@ -58,7 +59,9 @@ class SemiCircle:
 
 @dataclass(frozen=True)
 class Patch:
-    """A design in the patch frame: the disc has radius 1, u right, v down, angles from +u towards +v.
+    """A design in the patch frame.
+
+    The disc has radius 1. u points right, v points down, and angles grow from +u towards +v.
 
     Attributes
     ----------
@@ -101,12 +104,13 @@ class Patch:
     def cells(self) -> tuple[Float, Float, NDArray[np.bool_]]:
         """The polar chequer (radii, angles_deg, black).
 
-        * ``radii``, ndarray of shape (R + 1,): borders of the rings, ascending from 0.
-        * ``angles_deg``, ndarray of shape (A,): borders of the sectors, ascending in [0, 360).
-        * ``black``, ndarray of shape (R, A), bool: ink of the cell between the radii i and i + 1 and between the angles
-          j and j + 1. The last sector ends at the first angle.
+        * ``radii``, ndarray of shape (R + 1,): radii between which the rings lie, ascending from 0.
+        * ``angles_deg``, ndarray of shape (A,): angles between which the sectors lie, ascending in [0, 360).
+        * ``black``, ndarray of shape (R, A), bool: ``black[i, j]`` tells whether the cell between the radii i and i + 1
+          and between the angles j and j + 1 is black. The last sector ends at the first angle.
 
-        The chequer is the coarsest of its kind: every border separates black from white somewhere.
+        The disc has as few rings and sectors as possible: each border between two of them separates black from white
+        somewhere. The rim and the quiet zone are rings of their own, even beside a ring of the same ink.
         """
         radii = np.unique([0.0, 1.0, *(s.radius for s in self.semicircles)])
         angles = np.unique(np.round([(s.start_deg + a) % 360.0 for s in self.semicircles for a in (0, 180)], 9))
@@ -131,9 +135,15 @@ class Patch:
         return radii, angles, black
 
     def is_black(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """Return the ink at points of the patch frame, from shape (..., 2) to shape (...), bool.
+        """Return whether points of the patch frame are black. Points outside the patch are white.
 
-        Points outside the patch are white.
+        Parameters
+        ----------
+        points : array_like of shape (..., 2)
+
+        Returns
+        -------
+        ndarray of shape (...), bool
         """
         u, v = np.moveaxis(np.asarray(points, np.float64), -1, 0)
         radii, angles, black = self.cells
@@ -144,7 +154,7 @@ class Patch:
 
     @cached_property
     def black_region(self) -> Region:
-        """Exact outline of all black ink, without seams: cells that share an edge are merged."""
+        """Exact outline of all black ink, without seams: black cells that share a border are merged."""
         return trace_contours(*self.cells)
 
     @property
@@ -156,8 +166,9 @@ class Patch:
     def centre_is_crossing(self) -> bool:
         """Whether straight edges of at least two directions meet at the centre.
 
-        Straight edges stay straight under every perspective. Two directions therefore mark the centre exactly. Edges of
-        one direction leave the centre undetermined along the edge. Arcs alone mark a point that is biased under tilt.
+        Straight edges stay straight under every perspective. Edges of two directions therefore mark the centre exactly.
+        Edges of a single direction leave the centre undetermined along that direction. If a design has only arcs, the
+        centre can only be estimated from the arcs, and this estimate is biased under tilt.
         """
         _, angles, black = self.cells
         edges = angles[black[0] != np.roll(black[0], 1)]
@@ -165,13 +176,13 @@ class Patch:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the ink: designs whose prints are identical have the same digest."""
+        """SHA-256 of :attr:`cells`. Designs with the same digest have identical prints."""
         radii, angles, black = self.cells
         content = (np.round(radii, 9).tolist(), np.round(angles, 9).tolist(), black.astype(int).tolist())
         return hashlib.sha256(repr(content).encode()).hexdigest()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the design as the content of its TOML file, the inverse of :func:`parse_patch`."""
+        """Return the design as the content of its TOML file. :func:`parse_patch` is the inverse."""
         table: dict[str, Any] = {"schema": SCHEMA, "name": self.name, "id": self.patch_id, "disc": self.disc}
         table["semicircles"] = [{"radius": s.radius, "start_deg": s.start_deg, "ink": s.ink} for s in self.semicircles]
         if self.rim:
@@ -183,9 +194,9 @@ class Patch:
 
 @lru_cache(maxsize=256)
 def unit_polygons(patch: Patch, tolerance: float) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
-    """Return the polygons of the black ink, and those of the whole patch, in the patch frame.
+    """Return the polygons of the black ink and the polygons of the whole patch, in the patch frame.
 
-    ``tolerance`` is that of :func:`kpbench.geometry.flatten`, in disc radii.
+    ``tolerance`` is the largest distance between an arc and its chords, in disc radii.
     """
     return tuple(flatten(patch.black_region, tolerance)), tuple(flatten(patch.disc_region, tolerance))
 
@@ -226,7 +237,7 @@ def load_patch(path: str | Path) -> Patch:
     Raises
     ------
     DesignError
-        If the file cannot be read, is no TOML, or describes no design.
+        If the file cannot be read, is not TOML, or does not describe a design.
     """
     return parse_patch(read_toml(path, DesignError), str(path))
 

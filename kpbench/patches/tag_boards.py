@@ -1,7 +1,8 @@
-"""Boards of tags (ArUco, AprilTag, ChArUco) whose corners are keypoints, for the same scenes as boards of patches.
+"""Boards of tags (ArUco, AprilTag, ChArUco), for the same scenes as boards of patches.
 
-A tag board is a square of black and white modules with a border of one white module. It has at least six keypoints,
-as :func:`kpbench.patches.hexagon_board` has. The tags are as large as the square permits.
+The keypoints are the corners of the tags, or the inner corners of the ChArUco pattern. A tag board is a square of black
+and white modules with a white border of at least one module. A tag board has at least six keypoints;
+:func:`kpbench.patches.hexagon_board` has six. The tags are as large as the square permits.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ DICTIONARIES = {
     "apriltag": cv2.aruco.DICT_APRILTAG_36h11,
     "charuco": cv2.aruco.DICT_4X4_50,
 }
-TAGS_PER_BOARD = 2  # on a diagonal, with eight corners together
-CHARUCO_SQUARES = (4, 3)  # columns and rows, with six inner corners
+TAGS_PER_BOARD = 2  # both tags lie on a diagonal and have eight corners together
+CHARUCO_SQUARES = (4, 3)  # columns and rows; the pattern has six inner corners
 SQUARE_MODULES, MARKER_MODULES = 8, 6  # side of a ChArUco square, and of the marker within the square, in modules
 
 
@@ -33,7 +34,8 @@ SQUARE_MODULES, MARKER_MODULES = 8, 6  # side of a ChArUco square, and of the ma
 class TagCorner:
     """A corner of a tag board as a keypoint.
 
-    The circle about the corner takes the role of a patch's disc: the tolerance ε is a fraction of its radius.
+    A circle about the corner takes the role of a patch's disc: the matching threshold is a fraction of the circle's
+    radius.
 
     Attributes
     ----------
@@ -91,7 +93,7 @@ class TagBoard:
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """Return the outlines as :meth:`kpbench.patches.Board.outlines` does; all ink is a single part."""
+        """Return the outlines as :meth:`kpbench.patches.Board.outlines` does. All ink is a single part."""
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
         ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]
@@ -112,7 +114,7 @@ class TagBoard:
 
 
 def tag_dictionary(board: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary of the tags of a board."""
+    """Return OpenCV's dictionary from which a board takes its tags."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARIES[board])
 
 
@@ -152,7 +154,7 @@ def tag_board(name: str, side_mm: float) -> TagBoard:
 
 
 Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
-"""Modules of a board, and each keypoint's id with its column and row of modules from the top left."""
+"""Modules of a board, and the position (x, y) of each keypoint id, in modules from the top-left corner of the board."""
 
 
 def _two_tags(name: str) -> Modules:

@@ -1,7 +1,7 @@
 """ASCII DXF of AutoCAD 2000 for laser and plotter, with exact arcs.
 
-The group codes, and the tables that readers insist on, are those of Autodesk's *DXF Reference*. A tag is a pair (group
-code, value). The frame of DXF has **y up** and its origin at the bottom-left corner of the page.
+The group codes and the required tables follow Autodesk's *DXF Reference*. A tag is a pair (group code, value). In the
+frame of DXF, **y points up**, and the origin is the bottom-left corner of the page.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
 
 
 def to_dxf(page: Page) -> bytes:
-    """Return the page as DXF in mm. Contours are closed polylines whose arcs are exact bulges.
+    """Return the page as DXF in mm. Contours are closed polylines. Arcs are stored exactly, as bulges.
 
     Parameters
     ----------
@@ -50,13 +50,17 @@ def _dxf_value(value: Any) -> str:
 
 
 def _dxf_text(text: str) -> str:
-    """Return the text with escapes for characters outside ASCII, and without ``%%``, which is a control code."""
+    """Return the text with escapes for characters outside ASCII.
+
+    An escape holds only four hexadecimal digits: characters from U+10000 up are dropped. ``%%`` would start a control
+    code, and becomes ``% %``.
+    """
     units = "".join(c if c.isascii() else f"\\U+{ord(c):04X}" for c in text if ord(c) < 0x10000)
     return units.replace("%%", "% %")
 
 
 def _dxf_vertices(contour: Contour, height: float) -> list[tuple[int, Any]]:
-    """Return the vertices of a contour. An arc has the bulge ``-tan(sweep / 4)``, as y points up in DXF."""
+    """Return the vertices of a contour. An arc has the bulge ``-tan(sweep / 4)``: minus, as y points up in DXF."""
     parts = [piece for part in contour for piece in split_arc(part, 180.0)]
     tags: list[tuple[int, Any]] = [(90, len(parts)), (70, 1), (43, 0.0)]
     for part in parts:
@@ -76,7 +80,7 @@ def _dxf_table(name: str, handle: str, entries: Sequence[Sequence[tuple[int, Any
 
 
 def _dxf_head(page: Page, next_handle: int) -> list[tuple[int, Any]]:
-    """Return the header, the tables and the blocks, which stand before the entities."""
+    """Return the sections before the entities: header, classes, tables, blocks."""
 
     def record(kind: str, handle: str, owner: str, sub: str, name: str, *rest: tuple[int, Any]) -> list[Any]:
         table_record = (100, "AcDbSymbolTableRecord")

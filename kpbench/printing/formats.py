@@ -1,4 +1,4 @@
-"""Table of the print formats: suffix of the file to its writer."""
+"""Table of the print formats: a writer for each file suffix."""
 
 from __future__ import annotations
 
@@ -16,4 +16,4 @@ PAGE_WRITERS: dict[str, Callable[[Sequence[Page], float], list[bytes]]] = {
     ".pdf": lambda pages, dpi: [to_pdf(pages)],
     ".dxf": lambda pages, dpi: [to_dxf(page) for page in pages],
 }
-"""Suffix to a function (pages, dpi) -> contents of the files. PDF has one file, other formats one file per page."""
+"""A function (pages, dpi) -> contents of the files, by suffix. PDF makes one file, other formats one file per page."""

@@ -1,4 +1,4 @@
-"""Marks on a page before any mirroring: rulers, lines of text, cut marks, registration crosses."""
+"""Rulers, lines of text, cut marks and registration crosses, in the page frame before any mirroring."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from kpbench.printing.font import FONT_SIZE, SMALLEST_FOOT, font_size
 from kpbench.printing.page import CUT, MARKS, Shape, Text
 from kpbench.printing.page_format import BLANK, PAGE_MARGIN, STRIP, PageFormat
 
-LINE = 0.1  # mm, width of every mark
-TICK_GAP, TICK = 1.0, 2.0  # mm, distance of a cut mark from the cut, and length of the mark
-CROSS_ARM = 2.5  # mm, from the centre of a registration cross to its end
+LINE = 0.1  # mm: width of every mark
+TICK_GAP, TICK = 1.0, 2.0  # mm: distance of a cut mark from a disc (half of it from a board), and length of the mark
+CROSS_ARM = 2.5  # mm: length of each arm of a registration cross
 
 
 def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
-    """Return both rulers, the line of text on top, and the line of text at the bottom right."""
+    """Return both rulers with their labels, the line of text on top, and the foot at the bottom right."""
     (ruler_x, ruler_y), width, height = page_format.rulers_mm, page_format.width_mm, page_format.height_mm
     inner, below = BLANK + STRIP, height - BLANK - STRIP
     shapes = [
@@ -61,7 +61,8 @@ def disc_marks(x: float, y: float, radius: float) -> list[Shape]:
 def crop_mark(x: float, y: float, right: int, down: int) -> Region:
     """Return two cut marks that continue the edges of a board beyond its corner at (x, y).
 
-    ``right`` and ``down`` are 1 or -1: the directions in which the marks lead away from the board.
+    ``right`` is 1 if the horizontal mark leads to the right, and -1 if it leads to the left. ``down`` is 1 if the
+    vertical mark leads down, and -1 if it leads up.
     """
     near, half = TICK_GAP / 2, LINE / 2
     along = rectangle(x + near if right > 0 else x - near - TICK, y - half, TICK, LINE)

@@ -5,8 +5,8 @@ and circular arcs, filled black. Shapes are never stroked: a stroke would make t
 
 Layers
 ------
-``INK`` and ``MARKS`` are printed. ``CUT`` is the path of a knife or laser. Only DXF contains this layer: a printed line
-would touch the part that is cut out.
+``INK`` and ``MARKS`` are printed. ``CUT`` is the path of a knife or laser. Only DXF contains the layer ``CUT``: a
+printed line along the cut would stay visible on the part that is cut out.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class Text:
 
     @property
     def clean(self) -> str:
-        """The text with a question mark in place of each control character: no format can hold those."""
+        """The text with a question mark in place of each character that is not printable."""
         return "".join(c if c.isprintable() else "?" for c in self.text)
 
 
@@ -109,7 +109,7 @@ class Page:
 
 
 def round_to_nm(value: float) -> float:
-    """Return millimetres rounded to 1 nm, so that files hold no noise of floating point."""
+    """Return a length in mm rounded to 1 nm, which keeps rounding errors out of files."""
     return round(value, 6) + 0.0
 
 
@@ -133,7 +133,7 @@ def start_point(part: Line | Arc) -> tuple[float, float]:
 
 
 def split_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
-    """Return a line as it is, or the equal arcs of at most ``max_deg`` that make up an arc."""
+    """Split an arc into equal arcs of at most ``max_deg`` degrees. Return a line unchanged."""
     if isinstance(part, Line):
         return (part,)
     count = math.ceil(abs(part.sweep_deg) / max_deg - 1e-9)
@@ -142,5 +142,5 @@ def split_arc(part: Line | Arc, max_deg: float) -> Iterable[Line | Arc]:
 
 
 def split_arcs(region: Region, max_deg: float) -> list[list[Line | Arc]]:
-    """Return the contours of a region with each arc split into equal arcs of at most ``max_deg``."""
+    """Return the contours of a region with each arc split into equal arcs of at most ``max_deg`` degrees."""
     return [[piece for part in contour for piece in split_arc(part, max_deg)] for contour in region]

@@ -1,7 +1,11 @@
 """Page formats: the size of the paper, its margins, and whether labels and mirroring are wanted.
 
-From the edge of the page inwards lie 5 mm that many printers leave blank, a strip of 3 mm for text and rulers, a strip
-of 3 mm for cut marks and registration marks, and the area for ink.
+A page has four zones, from the edge inwards:
+
+1. a margin of 5 mm that many printers leave blank,
+2. a strip of 3 mm for text and rulers,
+3. a strip of 3 mm for cut marks and registration crosses,
+4. the area for ink.
 """
 
 from __future__ import annotations
@@ -21,8 +25,8 @@ PAGE_SIZES_MM = {  # width and height; ISO 216 and ANSI Y14.1
     "letter": (215.9, 279.4),
     "legal": (215.9, 355.6),
 }
-BLANK, STRIP = 5.0, 3.0  # mm, see the module's docstring
-PAGE_MARGIN = BLANK + 2 * STRIP  # mm, from the edge of the page to the area for ink
+BLANK, STRIP = 5.0, 3.0  # mm: widths of the zones in the module's docstring
+PAGE_MARGIN = BLANK + 2 * STRIP  # mm: from the edge of the page to the area for ink
 LONGEST_RULER = 100.0  # mm
 
 
@@ -58,12 +62,12 @@ class PageFormat:
 
     @property
     def rulers_mm(self) -> tuple[float, float]:
-        """Lengths of the rulers in x and y: 100 mm, or a smaller multiple of 10 mm on a small page."""
+        """Lengths of the rulers in x and y: 100 mm, or on a small page the largest multiple of 10 mm that fits."""
         x, y = (min(LONGEST_RULER, 10.0 * math.floor(side / 10)) for side in self.ink_size_mm)
         return x, y
 
     def position_on_paper(self, x: float, y: float) -> tuple[float, float]:
-        """Return where a point of the layout is printed, after any mirroring, in mm rounded to 1 nm."""
+        """Return the position of a point of the layout after any mirroring of the page, in mm rounded to 1 nm."""
         return round_to_nm(self.width_mm - x if self.mirrored else x), round_to_nm(y)
 
     def make_page(self, shapes: Iterable[Shape], texts: Iterable[Text], title: str) -> Page:
@@ -73,7 +77,7 @@ class PageFormat:
 
 
 def parse_page_format(page: str, landscape: bool = False, labels: bool = True, mirrored: bool = False) -> PageFormat:
-    """Return the page format with a name or a size.
+    """Return the page format for a name or a size.
 
     Parameters
     ----------
@@ -87,7 +91,7 @@ def parse_page_format(page: str, landscape: bool = False, labels: bool = True, m
     Raises
     ------
     DesignError
-        If the name is unknown, or a side is not from 40 to 5000 mm.
+        If the name is unknown, or a side is shorter than 40 mm or longer than 5000 mm.
 
     Examples
     --------

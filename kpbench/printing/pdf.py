@@ -12,14 +12,14 @@ from kpbench.printing.font import PDF_FONT
 from kpbench.printing.page import CUT, Page, split_arcs, start_point
 
 PT_PER_MM = 72 / 25.4
-LONGEST_ARC_DEG = 22.5  # of one Bézier curve; the error of the curve is below 1e-7 of the radius
+LONGEST_ARC_DEG = 22.5  # largest sweep of one Bézier curve; the curve is off the arc by less than 1e-7 radii
 
 
 def to_pdf(pages: Sequence[Page]) -> bytes:
     """Return all pages as one PDF.
 
-    An arc becomes cubic Bézier curves of at most :data:`LONGEST_ARC_DEG`. The control points lie on the tangents at the
-    ends, at a distance of ``4/3 tan(sweep / 4)`` radii.
+    An arc becomes cubic Bézier curves of at most :data:`LONGEST_ARC_DEG` degrees. The control points of a curve lie on
+    the tangents at its ends, ``4/3 tan(sweep / 4)`` radii away from the ends.
 
     Parameters
     ----------

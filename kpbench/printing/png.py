@@ -1,4 +1,4 @@
-"""PNG whose pixels are grey by the exact area that ink covers; the file contains its resolution."""
+"""PNG in grey: each pixel is darkened by the exact area that ink covers. The file contains its resolution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_PIXELS = 1_000_000_000
 
 
 def px_per_mm(dpi: float) -> float:
-    """Return the pixels per mm of a PNG. The file holds whole pixels per metre, and the page is drawn at that scale.
+    """Return the pixels per mm of a PNG, rounded to whole pixels per metre, as the file stores the resolution.
 
     Examples
     --------
@@ -31,8 +31,8 @@ def px_per_mm(dpi: float) -> float:
 def to_png(page: Page, dpi: float) -> bytes:
     """Return the page as 8-bit grey PNG.
 
-    The top-left corner of the page is the corner of the first pixel. A coordinate x in mm therefore is
-    ``x * px_per_mm(dpi) - 0.5`` px.
+    The top-left corner of the page is the top-left corner of the first pixel, half a pixel from the centre of the
+    pixel. A coordinate of x mm is therefore ``x * px_per_mm(dpi) - 0.5`` px.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def to_png(page: Page, dpi: float) -> bytes:
     paper = np.full((height, width), 255, np.uint8)
 
     def ink(x: int, y: int, covered: NDArray[np.float64]) -> None:
-        """Darken the paper. The areas of shapes that share a pixel add up."""
+        """Darken the paper. If shapes share a pixel, their covered areas add up."""
         rows, columns = slice(max(y, 0), y + covered.shape[0]), slice(max(x, 0), x + covered.shape[1])
         below = paper[rows, columns]
         part = covered[rows.start - y :, columns.start - x :][: below.shape[0], : below.shape[1]]
@@ -86,11 +86,11 @@ def to_png(page: Page, dpi: float) -> bytes:
 
 
 def _letters(text: Text, scale: float) -> tuple[NDArray[np.float64], float, float]:
-    """Return the coverage of a line of text, and the px from its baseline point to the first column and row."""
+    """Return the ink coverage of a text, and the x and y of its top-left pixel in px from its point on the baseline."""
     from PIL import Image, ImageDraw
 
     font = png_font(text.size * scale)
-    line = text.clean.encode("ascii", "replace").decode()  # the built-in font has no other characters
+    line = text.clean.encode("ascii", "replace").decode()  # Pillow's built-in font is used for ASCII only
     anchor = {"start": "ls", "middle": "ms", "end": "rs"}[text.anchor]
     left, top, right, bottom = ImageDraw.Draw(Image.new("L", (1, 1))).textbbox((0, 0), line, font, anchor)
     image = Image.new("L", (max(math.ceil(right - left), 1), max(math.ceil(bottom - top), 1)))

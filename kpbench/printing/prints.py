@@ -44,13 +44,13 @@ def print_patches(
     copies : int
         Number of copies of each patch.
     page : str or PageFormat
-        Such as "a4" or "200x300mm", see :func:`kpbench.printing.parse_page_format`.
+        Page format such as "a4" or "200x300mm". See :func:`kpbench.printing.parse_page_format`.
     formats : sequence of str
         Some of "pdf", "svg", "png" and "dxf".
     dpi : float
         Resolution of PNG.
     progress : callable
-        Called with the number of sheets that were written since the call before.
+        Called with the number of sheets written since the last call.
 
     Returns
     -------
@@ -60,7 +60,7 @@ def print_patches(
     Raises
     ------
     DesignError
-        If a patch does not fit the page, or the format of a file or page is unknown.
+        If a patch does not fit the page, or a file format or page format is unknown.
     DataError
         If a file cannot be written.
 
@@ -86,7 +86,7 @@ def print_boards(
 ) -> list[Path]:
     """Write prints of boards, and for each board a sidecar with the position of every keypoint.
 
-    No file is written unless every board fits its page.
+    If one board does not fit the page, no file is written for any board.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def print_boards(
     Raises
     ------
     DesignError
-        If a board does not fit the page, two boards have the same file name, or the format of a file or page is
+        If a board does not fit the page, two boards have the same file name, or a file format or page format is
         unknown.
     DataError
         If a file cannot be written.
@@ -145,8 +145,8 @@ def _save_sheets(
 def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: float = 600) -> list[Path]:
     """Write a sheet in several formats, and its sidecar.
 
-    Files are ``NAME.suffix``. A format with one page per file gives ``NAME-1.suffix``, ``NAME-2.suffix``, … for several
-    pages.
+    The files are named ``NAME.suffix``. If a format holds one page per file and the sheet has several pages, the files
+    are named ``NAME-1.suffix``, ``NAME-2.suffix``, and so on.
 
     Parameters
     ----------
@@ -193,5 +193,9 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
 
 
 def file_stem(name: str) -> str:
-    """Return a file name for a board: letters, digits, ``_``, ``.`` and ``-`` stay, other characters become ``-``."""
+    """Return a file name without suffix for a board.
+
+    Letters, digits, ``_``, ``.`` and ``-`` stay. Each run of other characters becomes one ``-``. Dots and hyphens at
+    both ends are dropped.
+    """
     return re.sub(r"[^\w.-]+", "-", name).strip(".-") or "board"

@@ -1,7 +1,7 @@
 """Sheets: patches to cut out, or a board, laid out on pages with rulers, cut marks, labels and a sidecar.
 
-Page frame: mm, x right, y down. The origin is the top-left corner of the page. A page is never scaled. A patch or board
-that is larger than the page is an error.
+Page frame: mm, x right, y down. The origin is the top-left corner of the page. A page is never scaled. A patch that is
+larger than the page is an error. A board that is larger than the page is an error unless the board is tiled.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from kpbench.printing.page_format import PAGE_MARGIN, PageFormat
 from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, sidecar_entry, sidecar_head
 from kpbench.printing.tiling import Tile, cut_into_tiles
 
-CELL_GAP = 2 * (TICK_GAP + TICK) + 2.0  # mm, between two patches to cut out
-LABEL_HEIGHT = 4.5  # mm, below a patch to cut out
+CELL_GAP = 2 * (TICK_GAP + TICK) + 2.0  # mm: gap between two patches to cut out
+LABEL_HEIGHT = 4.5  # mm: space for the label below a patch to cut out
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Sheet:
     Attributes
     ----------
     name : str
-        Beginning of the names of the files.
+        Name of the print. The names of the files begin with this name.
     pages : tuple of Page
     sidecar : mapping
         Content of the JSON file.
@@ -87,7 +87,7 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageF
         largest = (min(width, height - LABEL_HEIGHT) - CELL_GAP) / extent
         raise DesignError(
             f"a patch of {diameter_mm:g} mm does not fit the {page_format.width_mm:g} x {page_format.height_mm:g} mm "
-            f"page; the largest diameter that does is {_round_down(largest)} mm"
+            f"page; the largest diameter that fits is {_round_down(largest)} mm"
         )
     prints = [patch for patch in patches for _ in range(copies)]
     columns = min(columns, len(prints))
@@ -117,8 +117,8 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageF
 def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sheet:
     """Lay out a board in the middle of one page, or with ``tile`` on as few pages as possible.
 
-    Tiles are cut along straight seams that pass between patches. Crosses mark the corners of every tile. Neighbours
-    share their crosses.
+    The board is cut into tiles along straight seams that pass between patches. Registration crosses mark the corners of
+    every tile. Tiles that share a corner of the board frame carry a cross each at this corner.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
     Raises
     ------
     DesignError
-        If the board does not fit the page and ``tile`` is false, or if no seam passes between its patches. The first
-        message names the largest diameter that fits.
+        If the board does not fit the page and ``tile`` is false; the message names the largest diameter that fits. Or
+        if ``tile`` is true and no straight seam passes between the patches.
 
     Examples
     --------
@@ -148,7 +148,7 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
         raise DesignError(
             f"board {board.name!r} is {board.side_x_mm:g} x {board.side_y_mm:g} mm, and the "
             f"{page_format.width_mm:g} x {page_format.height_mm:g} mm page holds {width:g} x {height:g} mm; "
-            "the largest diameter that fits, the whole board made smaller with it, is "
+            "if the whole board is made smaller, the largest diameter that fits is "
             f"{_round_down(scale * max(k.diameter_mm for k in board.keypoints))} mm; "
             "`tile=True` spreads the board over pages"
         )
@@ -203,7 +203,7 @@ def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], page_format: Pag
 
 
 def _on_page(tile: Tile, page_format: PageFormat, x: float, y: float) -> tuple[float, float]:
-    """Return where a point of the board lies in the layout: the tile is in the middle of the page."""
+    """Return the position in the layout of a point of the board. The tile lies in the middle of the page."""
     return x + (page_format.width_mm - tile.x0 - tile.x1) / 2, y + (page_format.height_mm - tile.y0 - tile.y1) / 2
 
 
@@ -212,5 +212,5 @@ def _ink(patch: Patch, x: float, y: float, diameter: float, rotate_deg: float) -
 
 
 def _round_down(diameter: float) -> str:
-    """Return a diameter in mm, rounded down to 0.01 mm so that it still fits."""
+    """Return a diameter in mm as text, rounded down to 0.01 mm so that the diameter still fits."""
     return f"{math.floor(diameter * 100 + 1e-6) / 100:g}"

@@ -1,7 +1,8 @@
 """Sidecars: JSON files beside a print that list the position of every keypoint.
 
-``kpbench.board/1`` lists positions in the board frame (for ``cv2.solvePnP``) and on the page. ``kpbench.sheet/1`` is of
-patches to be cut out, and lists positions on the page only. The documentation of printing lists the fields.
+The schema ``kpbench.board/1`` is for boards. Such a sidecar lists positions in the board frame (for ``cv2.solvePnP``)
+and on the page. The schema ``kpbench.sheet/1`` is for patches to be cut out. Such a sidecar lists positions on the page
+only. The documentation of printing lists the fields.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from kpbench.printing.page_format import PageFormat
 
 BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
-LARGEST_ERROR = 0.1  # a ruler that is off by a larger fraction was measured wrongly
+LARGEST_ERROR = 0.1  # a ruler was measured wrongly if its length is off by a larger fraction
 
 
 def sidecar_head(
@@ -44,7 +45,7 @@ def sidecar_head(
 def sidecar_entry(
     index: int, patch: Patch, rotate_deg: float, diameter_mm: float, page: int, on_paper: tuple[float, float]
 ) -> dict[str, Any]:
-    """Return the entry of one keypoint; pages count from 1."""
+    """Return the entry of one keypoint. Pages count from 1."""
     return {
         "index": index,
         "patch_id": patch.patch_id,
@@ -57,7 +58,7 @@ def sidecar_entry(
 
 
 def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> list[Path]:
-    """Write ``NAME.measured.json`` beside each sidecar of a folder, with the lengths that the printer produced.
+    """Write ``NAME.measured.json`` beside each sidecar of a folder, with lengths corrected to the real print.
 
     Parameters
     ----------
@@ -74,7 +75,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     Raises
     ------
     DesignError
-        If the folder holds no sidecar, a sidecar is incomplete, or a length is more than a tenth off.
+        If the folder holds no sidecar, a sidecar is incomplete, or a measured length is more than 10 % off.
 
     Examples
     --------
@@ -107,9 +108,10 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
 def correct_sidecar(
     sidecar: Mapping[str, Any], measured_mm: tuple[float, float], source: str = "sidecar"
 ) -> dict[str, Any]:
-    """Return the sidecar with the lengths that the printer produced; positions on the page stay those of the file.
+    """Return the sidecar with lengths corrected to the real print. Positions on the page are not corrected.
 
-    A disc with different scales in x and y is an ellipse. Its diameter becomes the geometric mean of both.
+    If the scales in x and y differ, a printed disc is an ellipse. Its diameter in the sidecar becomes the geometric
+    mean of the ellipse's two axes.
     """
     scale = [measured / nominal for measured, nominal in zip(measured_mm, sidecar["ruler_mm"], strict=True)]
     for axis, s, measured, nominal in zip("xy", scale, measured_mm, sidecar["ruler_mm"], strict=True):

@@ -15,7 +15,7 @@ def _mm(*values: float) -> str:
 
 
 def _svg_path(region: Region) -> str:
-    """Return path data. Arcs cover at most 90 degrees: rounded ends would move the centres of longer arcs."""
+    """Return path data. Arcs are split at 90 degrees: rounding the ends of longer arcs would move their centres."""
     data = []
     for contour in split_arcs(region, 90.0):
         data.append("M" + _mm(*start_point(contour[0])))

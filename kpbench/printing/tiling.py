@@ -1,4 +1,4 @@
-"""Tiles: a board cut into pieces of the size of a page, along straight seams that pass between patches."""
+"""Tiles: pieces of a board that fit a page each, cut along straight seams that pass between patches."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from kpbench.errors import DesignError
 from kpbench.patches.board import Board
 
-SEAM_CLEARANCE = 1.0  # mm, between a seam and any patch: enough for a careful cut with a knife
+SEAM_CLEARANCE = 1.0  # mm: least distance between a seam and a patch, enough for a careful cut with a knife
 
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile: its row and column, both from 0, and its window in mm of the board frame."""
+    """A tile: its row and column, both counted from 0, and its window in mm of the board frame."""
 
     row: int
     column: int
@@ -28,12 +28,12 @@ class Tile:
         return [(x, y) for y in (self.y0, self.y1) for x in (self.x0, self.x1)]
 
     def contains(self, x_mm: float, y_mm: float) -> bool:
-        """Return whether a point of the board lies in the window; a seam belongs to the tile on its right or below."""
+        """Return whether a point lies in the window. A point on a seam lies in the tile right of or below the seam."""
         return self.x0 <= x_mm < self.x1 and self.y0 <= y_mm < self.y1
 
 
 def cut_into_tiles(board: Board, width_mm: float, height_mm: float) -> list[Tile]:
-    """Cut a board into the least number of tiles of at most a given size, listed row by row.
+    """Cut a board into as few tiles as possible, of at most the given size. Return the tiles row by row.
 
     Raises
     ------
@@ -61,16 +61,17 @@ def cut_into_tiles(board: Board, width_mm: float, height_mm: float) -> list[Tile
 
 
 def _seams(spans: Sequence[tuple[float, float]], side: float, longest: float) -> list[float] | None:
-    """Return both ends and the seams along one axis, for the least number of pieces of at most ``longest``.
+    """Return the ends of the board and the seams along one axis, in ascending order.
 
-    ``spans`` are the extents of the patches along the axis. Seams lie in the middle of the gaps between patches where
-    that is possible. None means that no seam passes.
+    The pieces between are as few as possible and at most ``longest`` mm long. ``spans`` holds the ends of every patch
+    along the axis. A seam lies in the middle of its gap between patches, unless a piece would become too long. Return
+    None if no seam passes between the patches.
     """
     blocked = sorted(((low - SEAM_CLEARANCE, high + SEAM_CLEARANCE) for low, high in spans), key=lambda b: -b[1])
     cuts = [-side / 2]
     while side / 2 - cuts[-1] > longest + 1e-6:
         seam = cuts[-1] + longest
-        for low, high in blocked:  # sorted from the far end: one pass is enough
+        for low, high in blocked:  # sorted by descending ends: one pass finds the seam
             if low < seam < high:
                 seam = low
         if seam <= cuts[-1]:

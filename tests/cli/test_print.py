@@ -97,7 +97,7 @@ def test_measured_corrects_what_was_printed_and_renders_nothing():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--diameter-mm", 300), r"the largest diameter that does is 180 mm"),
+        (("--diameter-mm", 300), r"the largest diameter that fits is 180 mm"),
         (("--page", "b5"), "--page is 'b5', expected a4"),
         (("--patch", "nobody"), "patch 'nobody' is not known; known are: "),
         (("--board", "hexagon", "--diameter-mm", 40), "the largest diameter that fits"),

@@ -149,7 +149,7 @@ def test_board_file_with_grid_and_own_designs(tmp_path):
     board = load_board(path)
     assert [p.patch_id for p in board.patches] == [7]
     assert (board.side_x_mm, board.side_y_mm, len(board.keypoints)) == (120, 80, 6)
-    with pytest.raises(DesignError, match="designs is set in the file, and others were given"):
+    with pytest.raises(DesignError, match="designs is set in the file, and other designs were given"):
         load_board(path, PATCHES)
 
 
