@@ -191,8 +191,8 @@ tags: [keypoint-patches, simulated]
 |---|---|
 {facts}
 
-The images are simulated by kpbench. Each image is a function of the configuration in `dataset.json`, the seed and the
-background files. If the background files are photographs, the licence of the photographs holds for their visible parts.
+The images are simulated by kpbench; each is a function of the configuration in `dataset.json`, the seed and the
+background files. Where those are photographs, their licence holds for what is seen of them here.
 
 ```python
 import kpbench

@@ -150,7 +150,7 @@ class Dataset:
         return self._open(n), index - self.shards[n].first, self.path / self.shards[n].file
 
     def image(self, index: int) -> UInt8:
-        """Return the image at a position, which is not the image ID: (H, W) or (H, W, 3) uint8."""
+        """Return an image by its number in the dataset, from 0: uint8 (H, W) or (H, W, 3)."""
         file, row, path = self._locate(index)
         with shard_errors(path):
             return np.asarray(file["images"][row])

@@ -44,19 +44,19 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
     found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
     if len(found) != 1:
         known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
-        raise DesignError(f"patch {key!r} is {'carried by two designs' if found else 'not known'}; known are: {known}")
+        raise DesignError(f"patch {key!r} is {'the name or ID of several designs' if found else 'not known'}; known are: {known}")
     return found[0]
 
 
 def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
-    """Read a board from a TOML file that has either one ``[grid]`` or ``[[keypoint]]`` entries.
+    """Read a board from a TOML file. The file has one ``[grid]``, or at least one ``[[keypoint]]``, and not both.
 
     Parameters
     ----------
     path : str or Path
     patches : sequence of Patch, optional
-        Designs that the file may name. Default: the designs under ``designs`` in the file, or the shipped designs if
-        the file has no ``designs``. Paths under ``designs`` are relative to the file.
+        Designs that the keypoints may name. Default: the designs in the files that the key ``designs`` lists, relative
+        to the board's file. Without that key: the shipped designs.
     diameter_mm : float, optional
         Diameter of each disc whose diameter is not set in the file. Default: 30.
 
@@ -92,15 +92,15 @@ def parse_board(
         if not all(isinstance(file, str) for file in files):
             raise table.problem("designs", "a list of file names")
         if patches is not None:
-            raise DesignError("designs is set in the file, and other designs were given; drop one of them")
+            raise DesignError("the file sets the key designs, and other designs are given; drop the key or the designs")
         patches = load_patches([path.parent / file for file in files])
     elif patches is None:
         patches = shipped_patches()
     name = table.text("name", path.stem)
     if ("grid" in table) == ("keypoint" in table):
-        raise DesignError("expected either one [grid] or [[keypoint]] entries")
+        raise DesignError("expected one [grid], or at least one [[keypoint]], and not both")
     if "diameter_mm" in table and diameter_mm is not None:
-        raise DesignError(f"diameter_mm is set in the file, and {diameter_mm:g} was asked for; drop one of them")
+        raise DesignError(f"the file sets the key diameter_mm, and `diameter_mm` is {diameter_mm:g}; drop the key or `diameter_mm`")
     diameter = table.number("diameter_mm", *SIZE_MM, DEFAULT_DIAMETER_MM if diameter_mm is None else diameter_mm)
     if "grid" in table:
         board = _parse_grid(table.table("grid", GRID_KEYS), patches, diameter, name)

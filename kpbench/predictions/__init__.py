@@ -1,4 +1,4 @@
-"""Read and write predictions files in every format, and COCO annotations as truth."""
+"""Read and write predictions files in every format. Read COCO annotations as truth."""
 
 import lazy_loader
 

@@ -149,7 +149,7 @@ def test_board_file_with_grid_and_own_designs(tmp_path):
     board = load_board(path)
     assert [p.patch_id for p in board.patches] == [7]
     assert (board.side_x_mm, board.side_y_mm, len(board.keypoints)) == (120, 80, 6)
-    with pytest.raises(DesignError, match="designs is set in the file, and other designs were given"):
+    with pytest.raises(DesignError, match="the file sets the key designs, and other designs are given"):
         load_board(path, PATCHES)
 
 
@@ -160,8 +160,8 @@ POINT = "[[keypoint]]\npatch = 0\nx_mm = 0\ny_mm = 0\n"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"expected either one \[grid\] or \[\[keypoint\]\] entries"),
-        (GRID + POINT, "expected either one"),
+        ("", r"expected one \[grid\], or at least one \[\[keypoint\]\], and not both"),
+        (GRID + POINT, "expected one"),
         ("x = ", "not valid TOML"),
         ('schema = "kpbench.board-design/9"\n' + GRID, "schema is 'kpbench.board-design/9', expected"),
         ("colour = 1\n" + GRID, "unknown key 'colour'; known are: schema, name"),
@@ -207,7 +207,7 @@ def test_files_that_are_not_there(tmp_path):
 def test_diameter_from_two_sides_is_refused(tmp_path):
     path = write(tmp_path, "diameter_mm = 20\n" + GRID)
     assert load_board(path).keypoints[0].diameter_mm == 20
-    with pytest.raises(DesignError, match="diameter_mm is set in the file, and 30 was asked for"):
+    with pytest.raises(DesignError, match="the file sets the key diameter_mm, and `diameter_mm` is 30"):
         load_board(path, diameter_mm=30)
 
 
