@@ -44,7 +44,8 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
     found = [p for p in patches if key in (p.name, p.patch_id, str(p.patch_id)) and not isinstance(key, bool)]
     if len(found) != 1:
         known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
-        raise DesignError(f"patch {key!r} is {'the name or ID of several designs' if found else 'not known'}; known are: {known}")
+        problem = "the name or ID of several designs" if found else "not known"
+        raise DesignError(f"patch {key!r} is {problem}; known are: {known}")
     return found[0]
 
 
@@ -100,7 +101,8 @@ def parse_board(
     if ("grid" in table) == ("keypoint" in table):
         raise DesignError("expected one [grid], or at least one [[keypoint]], and not both")
     if "diameter_mm" in table and diameter_mm is not None:
-        raise DesignError(f"the file sets the key diameter_mm, and `diameter_mm` is {diameter_mm:g}; drop the key or `diameter_mm`")
+        given = f"and `diameter_mm` is {diameter_mm:g}; drop the key or `diameter_mm`"
+        raise DesignError(f"the file sets the key diameter_mm, {given}")
     diameter = table.number("diameter_mm", *SIZE_MM, DEFAULT_DIAMETER_MM if diameter_mm is None else diameter_mm)
     if "grid" in table:
         board = _parse_grid(table.table("grid", GRID_KEYS), patches, diameter, name)

@@ -88,7 +88,8 @@ def line_chart(
     y_range : (low, high), optional
         Default: from 0 to a little over the largest value.
     x_ticks : sequence of float, optional
-        Positions of the numbers on the x-axis. The axis extends to the first and the last position. Default: about five round numbers.
+        Positions of the numbers on the x-axis. The axis extends to the first and the last position. Default: about
+        five round numbers.
     log_x : bool
         Whether the x-axis is logarithmic. Then all x must be positive.
     markers : bool
