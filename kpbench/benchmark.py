@@ -27,7 +27,7 @@ from kpbench.dataset.shard import canonical_json
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
-from kpbench.files import make_folder, require_own_folder, write_atomic
+from kpbench.files import make_folder, require_own_folder
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.report.paper import PAPER
@@ -39,6 +39,7 @@ from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.types import Predictions
 from kpbench.workers import Progress, run_jobs
+from kpbench.writing import remove_file, write_file
 
 IMAGES_PER_PART = 32
 """Number of images whose detections are kept in one file until all parts are joined."""
@@ -214,7 +215,7 @@ def _digest_detector(detector: LoadedDetector) -> str:
 
 def _remove_predictions(file: Path) -> None:
     """Remove a predictions file and its parts."""
-    file.unlink(missing_ok=True)
+    remove_file(file, "predictions")
     shutil.rmtree(_parts_folder(file), ignore_errors=True)
 
 
@@ -333,7 +334,7 @@ def _write_suite_report(suite: str, runs: Sequence[BenchRun], out: Path, command
     for run in runs:
         provenance = collect_provenance(run.dataset.path, run.dataset.fingerprint, [run.predictions], command)
         name = f"{run.predictions.stem.rpartition('-')[0]}.json"
-        write_atomic(folder / name, encode_scores(run.scores, provenance | {"config": run.dataset.config}))
+        write_file(folder / name, encode_scores(run.scores, provenance | {"config": run.dataset.config}))
     patches = [run.scores for run in runs if run.config.board is None]
     tables = [paper_table(patches, PAPER[name]) for run in patches[:1] for name in run.conditions if name in PAPER]
     return SuiteReport(suite, (overview_table(scores), *tables, breakpoint_table(scores)), page, folder)

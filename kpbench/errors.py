@@ -30,6 +30,10 @@ class KpbenchError(Exception):
     """
 
 
+class KpbenchWarning(UserWarning):
+    """Something that the user should know and that stops no work. The command line prints the warning in one line."""
+
+
 class DesignError(KpbenchError):
     """A patch, a board or a page is impossible."""
 

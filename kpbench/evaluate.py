@@ -11,7 +11,7 @@ from typing import Any, Literal, Protocol, TypedDict, Unpack
 
 from kpbench.dataset.folder import MANIFEST, open_dataset
 from kpbench.errors import DataError, PredictionsError
-from kpbench.files import refuse_overwrite, write_atomic
+from kpbench.files import refuse_overwrite
 from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import read_predictions
 from kpbench.report.report import Report, require_report_suffix, write_report
@@ -26,6 +26,7 @@ from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pos
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score
 from kpbench.types import Predictions, Truth, UInt8
+from kpbench.writing import write_file
 
 DEFAULT_DATASET = Path("kpbench-data")
 """Default folder of ``kpbench synth``, and the truth if neither user nor file names a dataset that exists."""
@@ -199,9 +200,9 @@ def score_file(
     poses = _compute_poses(scores, dataset) if pose else ()
     provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
     if to_json:
-        write_atomic(to_json, encode_scores(scores, provenance, poses))
+        write_file(to_json, encode_scores(scores, provenance, poses))
     if to_csv:
-        write_atomic(to_csv, encode_scores_csv(scores, provenance))
+        write_file(to_csv, encode_scores_csv(scores, provenance))
     if to_report:
         _write_report(to_report, [scores], dataset, provenance, warn, poses=poses)
     return ScoredFile(scores, dataset, poses, provenance)
@@ -254,7 +255,7 @@ def compare_files(
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
     provenance = collect_provenance(dataset.path, dataset.fingerprint, paths, command)
     if to_json:
-        write_atomic(to_json, encode_comparisons(comparisons, provenance))
+        write_file(to_json, encode_comparisons(comparisons, provenance))
     if to_report:
         _write_report(to_report, scores, dataset, provenance, warn, comparisons)
     return ComparedFiles(comparisons, tuple(scores), dataset, provenance)

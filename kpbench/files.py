@@ -1,14 +1,13 @@
-"""Files and folders: find images, read text, write a file whole or not at all, use a URL as a folder."""
+"""Files and folders: find images, read text, use a URL as a folder."""
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import os
 import re
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -43,6 +42,35 @@ def image_files(folder: Path, exclude: Path | None = None) -> tuple[str, ...]:
     return tuple(sorted(f.relative_to(folder).as_posix() for f in files))
 
 
+_read: ContextVar[set[tuple[int, int]] | None] = ContextVar("read", default=None)
+"""Device and inode of each file that the running command has read; None outside of commands."""
+
+
+@contextmanager
+def protect_read_files() -> Iterator[None]:
+    """Let :func:`kpbench.writing.write_file` refuse, within a ``with`` block, the files that the block reads."""
+    token = _read.set(set())
+    try:
+        yield
+    finally:
+        _read.reset(token)
+
+
+def note_read(path: str | Path) -> None:
+    """Note that the running command reads a file. Every function that opens a file of the user calls this."""
+    noted = _read.get()
+    if noted is not None:
+        with suppress(OSError, ValueError):
+            found = os.stat(path)
+            noted.add((found.st_dev, found.st_ino))
+
+
+def is_read(path: Path) -> bool:
+    """Return whether the running command has read a file, under this name or another."""
+    found = path.stat()
+    return (found.st_dev, found.st_ino) in (_read.get() or ())
+
+
 def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     """Return the text of a UTF-8 file.
 
@@ -51,6 +79,7 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     error
         If the file cannot be read. The message names the file.
     """
+    note_read(path)
     try:
         return Path(path).read_text("utf-8")
     except OSError as problem:
@@ -154,51 +183,3 @@ def make_folder(folder: Path) -> Path:
     except OSError as error:
         raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
     return folder
-
-
-def write_atomic(path: Path, data: bytes | memoryview) -> None:
-    """Write a file whole or not at all.
-
-    On this machine: write a temporary file in the same folder, fsync the file, rename the file, fsync the folder. At a
-    URL: write the file with a single call. Object stores carry out such a call wholly or not at all.
-
-    Raises
-    ------
-    DataError
-        If the disk is full or the folder cannot be written. No file is left behind.
-    """
-    if not is_local(path):
-        with _remote_errors(path):
-            path.write_bytes(bytes(data))
-        return
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.chmod(name, 0o644)
-            os.replace(name, path)
-        except BaseException:
-            with suppress(OSError):
-                os.unlink(name)
-            raise
-        with suppress(OSError):  # some file systems do not let a folder be opened
-            folder = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-    except OSError as error:
-        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
-        raise DataError(f"{path}: cannot be written, {reason}") from None
-
-
-@contextmanager
-def _remote_errors(path: Path) -> Iterator[None]:
-    """Turn every error of a remote file system into a :class:`DataError` with a message of one line."""
-    try:
-        yield
-    except Exception as error:
-        raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None

@@ -5,6 +5,9 @@ Images are uint8, grey (H, W) or RGB (H, W, 3).
 
 from __future__ import annotations
 
+import secrets
+import struct
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,12 +17,21 @@ import cv2
 import numpy as np
 
 from kpbench.errors import DataError
-from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, write_atomic
+from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read
 from kpbench.types import UInt8
+from kpbench.writing import move_file, require_writable, write_file
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # of a single image into which detections are drawn
 DEFAULT_FPS = 25.0  # frames per second, of a video or camera that states no frame rate
+PNG_HEAD_BYTES = 33
+"""Length of the signature and of the first chunk (IHDR) of a PNG file."""
+_SOFTWARE = b"tEXtSoftware\0kpbench.picture/1"
+PNG_MARK = struct.pack(">I", len(_SOFTWARE) - 4) + _SOFTWARE + struct.pack(">I", zlib.crc32(_SOFTWARE))
+"""Chunk of a PNG file; it lets :func:`kpbench.writing.write_file` replace the file."""
+JPEG_MARK = b"\xff\xfe\0\x13kpbench.picture/1"
+"""The same as a comment of a JPEG file."""
+VIDEO_MARK = b"kpbench.video/1 "
 
 
 @dataclass(frozen=True)
@@ -66,6 +78,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
+        note_read(path)
         capture = cv2.VideoCapture(str(path))
         return _open_video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
     image = _decode(path)
@@ -88,6 +101,7 @@ def refuse_same_folder(source: str | Path, target: Path) -> None:
 
 
 def _decode(path: Path) -> UInt8 | None:
+    note_read(path)
     try:
         image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
     except (OSError, cv2.error):
@@ -148,13 +162,13 @@ def image_writer(
             yield write_frame
         return
 
-    def write_file(name: str, image: UInt8) -> None:
+    def write_drawing(name: str, image: UInt8) -> None:
         path = target if to_file else target / (name if name.endswith(".png") else f"{name}.png")
         make_folder(path.parent)
         # cv2.imwrite leaves half a file on a full disk, and ends the process if a name is not UTF-8
-        write_atomic(path, _encode(image, path.suffix.lower(), []))
+        write_file(path, _encode(image, path.suffix.lower(), []))
 
-    yield write_file
+    yield write_drawing
 
 
 @contextmanager
@@ -163,7 +177,8 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
 
     OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
     """
-    part = target.with_name(f".{target.stem}.part{target.suffix}")
+    require_writable(target, "video")
+    part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
     sizes = set[tuple[int, int]]()
     written = 0
@@ -188,11 +203,22 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
         if video and int(cv2.VideoCapture(str(part)).get(cv2.CAP_PROP_FRAME_COUNT)) != written:
             raise DataError(f"{target}: cannot be written whole, is the disk full?")
         if video:
-            part.replace(target)
+            with part.open("ab") as file:
+                file.write(_video_mark(target.suffix.lower()))
+            move_file(part, target)
     finally:
         for writer in video:
             writer.release()
         part.unlink(missing_ok=True)
+
+
+def _video_mark(suffix: str) -> bytes:
+    """Return an element that players skip: Void of Matroska, a JUNK chunk of AVI, a free box of MP4."""
+    if suffix in (".mkv", ".webm"):
+        return b"\xec" + bytes([0x80 | len(VIDEO_MARK)]) + VIDEO_MARK
+    if suffix == ".avi":
+        return b"JUNK" + struct.pack("<I", len(VIDEO_MARK)) + VIDEO_MARK
+    return struct.pack(">I", 8 + len(VIDEO_MARK)) + b"free" + VIDEO_MARK
 
 
 def resize(grey: UInt8, width: int, height: int) -> UInt8:
@@ -244,4 +270,7 @@ def encode_jpeg(image: UInt8, quality: int) -> bytes:
 
 def _encode(image: UInt8, suffix: str, settings: list[int]) -> bytes:
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    return cv2.imencode(suffix, pixels, settings)[1].tobytes()
+    data = cv2.imencode(suffix, pixels, settings)[1].tobytes()
+    if suffix == ".png":
+        return data[:PNG_HEAD_BYTES] + PNG_MARK + data[PNG_HEAD_BYTES:]
+    return data[:2] + JPEG_MARK + data[2:]

@@ -7,8 +7,9 @@ from click.testing import CliRunner
 from kpbench.cli import main
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard
-from kpbench.files import sha256_of, write_atomic
+from kpbench.files import sha256_of
 from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions
+from kpbench.writing import write_file
 
 
 def kpbench(*arguments, code=0):
@@ -52,7 +53,7 @@ def write_dataset(folder, images, condition="", seed=0):
         samples.append(Sample(n, np.zeros((8, 8), np.uint8), keypoints, condition=condition, rung=rung))
     config = {"seed": seed}
     path = folder / "shard-00000.h5"
-    write_atomic(path, encode_shard(samples, len(samples), config))
+    write_file(path, encode_shard(samples, len(samples), config))
     write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
     return open_dataset(folder)
 

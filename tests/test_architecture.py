@@ -28,7 +28,8 @@ GROUND = {
     "types": ["errors"],
     "files": ["errors"],
     "toml": ["errors", "files"],
-    "images": ["errors", "types", "files"],
+    "writing": ["errors", "files"],
+    "images": ["errors", "types", "files", "writing"],
     "workers": ["errors"],
     "seeds": [],
 }

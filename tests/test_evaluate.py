@@ -32,7 +32,7 @@ def test_a_file_scores_as_its_predictions_and_every_file_is_written(here):
     assert content["provenance"] == scored.provenance
     assert content["provenance"]["command"] == "my script"
     assert "my script" in (here / "r.html").read_text()
-    assert (here / "s.csv").read_text().startswith("detector,dataset,kpbench,condition")
+    assert (here / "s.csv").read_text().startswith("schema,detector,dataset,kpbench,condition")
     assert scored.poses == ()
 
 

@@ -12,9 +12,9 @@ from kpbench.analysis.measures import MEASURE_STEPS, Analysis, measure_designs
 from kpbench.analysis.natural_images import background_windows
 from kpbench.analysis.search import SEARCH_STEPS, SearchResult, search_designs
 from kpbench.errors import DesignError
-from kpbench.files import write_atomic
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.printing.formats import PAGE_WRITERS
+from kpbench.writing import write_file
 
 FIGURE_DPI = 200.0
 """Resolution of a figure that is written as PNG."""
@@ -103,9 +103,9 @@ def analyse_patches(
     analysis = measure_designs(measured, windows, progress)
     if json_file is not None:
         content = analysis.to_dict() | ({"search": found.to_dict()} if found else {})
-        write_atomic(Path(json_file), (json.dumps(content, indent=1) + "\n").encode())
+        write_file(Path(json_file), (json.dumps(content, indent=1) + "\n").encode())
     if figure_file is not None:
-        write_atomic(Path(figure_file), PAGE_WRITERS[suffix]([draw_designs(analysis, measured)], FIGURE_DPI)[0])
+        write_file(Path(figure_file), PAGE_WRITERS[suffix]([draw_designs(analysis, measured)], FIGURE_DPI)[0])
     return AnalysisRun(measured, analysis, found)
 
 

@@ -6,11 +6,15 @@ import contextlib
 import importlib
 import os
 import sys
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import click
 
 from kpbench import __version__
-from kpbench.errors import KpbenchError
+from kpbench.errors import KpbenchError, KpbenchWarning
 
 # The module of a command is imported when the command is run: `kpbench --help` must not wait for OpenCV, HDF5 or torch.
 # Each entry holds the module and function of a command, and the description of the command in `kpbench --help`.
@@ -53,8 +57,13 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
+        from kpbench.files import protect_read_files  # here, as it would slow down `kpbench --help`
+
         try:
-            return super().invoke(ctx)
+            with protect_read_files(), warnings.catch_warnings():
+                warnings.simplefilter("default", KpbenchWarning)
+                warnings.showwarning = partial(self._show_warning, ctx, warnings.showwarning)
+                return super().invoke(ctx)
         except KpbenchError as error:
             click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
@@ -68,6 +77,12 @@ class LazyGroup(click.Group):
         except (KeyboardInterrupt, click.Abort) as stop:
             click.echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
             sys.exit(130)
+
+    def _show_warning(self, ctx: click.Context, show: Callable[..., None], message: Warning, *more: Any) -> None:
+        if isinstance(message, KpbenchWarning):
+            click.echo(f"kpbench: {self._translate(ctx, message)}", err=True)
+        else:
+            show(message, *more)
 
     def _translate(self, ctx: click.Context, problem: BaseException) -> str:
         """Return the message of a problem, with parameters of the library named as options of the command."""

@@ -68,13 +68,13 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     """
     from kpbench.dataset.card import draw_overview
     from kpbench.dataset.folder import open_dataset
-    from kpbench.files import write_atomic
     from kpbench.images import encode_png
+    from kpbench.writing import write_file
 
     data = open_dataset(dataset)
     sheet = draw_overview(data, count, columns, tile_width)
     target = out or data.path / "preview.png"
-    write_atomic(target, encode_png(sheet))
+    write_file(target, encode_png(sheet))
     click.echo(str(target))
 
 

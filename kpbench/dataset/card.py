@@ -11,12 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
-from kpbench.files import write_atomic
 from kpbench.images import encode_png
 from kpbench.types import Float, UInt8
+from kpbench.writing import is_replaceable, write_file
 
 CARD_FILES = ("README.md", "preview.png")
 """The files that :func:`write_card` writes: the card and its picture."""
+CARD_MARK = "kpbench.card/1"
+"""Mark of a card that kpbench wrote. A card without the mark is the user's."""
 SIZE_CATEGORIES = (
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
 )  # fmt: skip
@@ -166,13 +168,18 @@ def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int
 def write_card(dataset: Dataset, folder: Path) -> None:
     """Write the dataset card into a folder: ``README.md`` with the header that dataset hubs read, and ``preview.png``.
 
+    Either file stays as it is if kpbench did not write it.
+
     Raises
     ------
     DataError
         If a file cannot be written.
     """
     card, picture = CARD_FILES
-    write_atomic(folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320)))
+    if is_replaceable(folder / picture, "picture"):
+        write_file(folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320)))
+    if not is_replaceable(folder / card, "card"):
+        return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
     facts = "\n".join(f"| {key} | {value} |" for key, value in dataset_facts(dataset).items())
     versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())
@@ -183,6 +190,7 @@ size_categories: ["{_size_category(len(dataset))}"]
 tags: [keypoint-patches, simulated]
 ---
 
+<!-- {CARD_MARK}: kpbench replaces this file as long as this line stands in it -->
 # Keypoint patches, {len(dataset)} simulated images
 
 ![Evenly spaced images with their true keypoints](preview.png)
@@ -204,7 +212,7 @@ image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
 
 Made with {versions}.
 """
-    write_atomic(folder / card, text.encode(errors="backslashreplace"))
+    write_file(folder / card, text.encode(errors="backslashreplace"))
 
 
 def _markdown_table(histogram: Histogram) -> str:

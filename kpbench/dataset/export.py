@@ -19,11 +19,15 @@ from numpy.typing import NDArray
 from kpbench.dataset.card import patch_names, write_card
 from kpbench.dataset.folder import Dataset
 from kpbench.errors import DataError
-from kpbench.files import make_folder, write_atomic
+from kpbench.files import make_folder
 from kpbench.geometry.homography import project_disc_boxes
 from kpbench.images import encode_png
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
+from kpbench.writing import write_file
+
+EXPORT_MARK = "kpbench.export/1"
+"""Mark of the file that names all other files of an export."""
 
 
 def export_dataset(
@@ -90,7 +94,7 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     for n in range(len(dataset)):
         image, keypoints = dataset[n]
         name = f"{ids[n]:08d}.png"
-        write_atomic(folder / "images" / name, encode_png(image))
+        write_file(folder / "images" / name, encode_png(image))
         height, width = image.shape[:2]
         groups = _scoring_groups(dataset, n)
         images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height, **groups})
@@ -112,9 +116,10 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         {"id": patch_id + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
         for patch_id, name in patch_names(dataset).items()
     ]
-    info = {"description": "kpbench dataset", "fingerprint": dataset.fingerprint}  # for `kpbench score`
+    # `kpbench score` compares the fingerprint
+    info = {"description": f"kpbench dataset ({EXPORT_MARK})", "fingerprint": dataset.fingerprint}
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
-    write_atomic(folder / "annotations.json", json.dumps(content).encode())
+    write_file(folder / "annotations.json", json.dumps(content).encode())
     return folder / "annotations.json"
 
 
@@ -142,13 +147,13 @@ def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
             numbers = [(x + w / 2) / width, (y + h / 2) / height, w / width, h / height]
             numbers += [(k["x"] + 0.5) / width, (k["y"] + 0.5) / height]
             lines.append(f"{classes[int(k['patch_id'])]} {' '.join(f'{v:.9f}' for v in numbers)} 2\n")
-        write_atomic(folder / "images" / f"{ids[n]:08d}.png", encode_png(image))
-        write_atomic(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
+        write_file(folder / "images" / f"{ids[n]:08d}.png", encode_png(image))
+        write_file(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
     listing = "".join(f"  {classes[patch_id]}: {json.dumps(name)}\n" for patch_id, name in names.items())
     # without a key `path`, YOLO looks for the folders beside this file
-    text = f"train: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listing}"
-    write_atomic(folder / "data.yaml", text.encode())
+    text = f"# {EXPORT_MARK}\ntrain: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listing}"
+    write_file(folder / "data.yaml", text.encode())
     return folder / "data.yaml"
 
 
@@ -167,7 +172,7 @@ def _export_webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Pa
                     entry.size = len(data)
                     tar.addfile(entry, io.BytesIO(data))
                 progress(1)
-        write_atomic(folder / f"shard-{number:05d}.tar", buffer.getvalue())
+        write_file(folder / f"shard-{number:05d}.tar", buffer.getvalue())
     return folder / "shard-00000.tar"
 
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from kpbench.dataset.shard import DATASET_SCHEMA, canonical_json, encode_utf8, open_shard, shard_errors
 from kpbench.errors import DataError
-from kpbench.files import folder_at, sha256_of, write_atomic
+from kpbench.files import folder_at, is_local, note_read, sha256_of
 from kpbench.types import Truth, UInt8
+from kpbench.writing import write_file
 
 MANIFEST = "dataset.json"
 MOST_OPEN_SHARDS = 128
@@ -74,7 +75,7 @@ def write_manifest(
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }
-    write_atomic(folder / MANIFEST, encode_utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
+    write_file(folder / MANIFEST, encode_utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
     return fingerprint
 
 
@@ -249,6 +250,8 @@ def _read_manifest(folder: Path) -> Dataset:
     """Return the dataset that the manifest of a folder describes. The shards are not checked."""
     manifest = folder / MANIFEST
     try:
+        if is_local(manifest):
+            note_read(manifest)
         content = json.loads(manifest.read_text("utf-8"))
         if content["schema"] != DATASET_SCHEMA:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")

@@ -38,8 +38,9 @@ from kpbench.dataset.resume import (
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local, make_folder, write_atomic
+from kpbench.files import folder_at, is_local, make_folder
 from kpbench.workers import Progress, dask_executor, run_jobs
+from kpbench.writing import write_file
 
 
 @dataclass(frozen=True)
@@ -238,7 +239,7 @@ def _link_or_copy(source: Path, target: Path) -> None:
     try:
         os.link(source, target)
     except OSError:
-        write_atomic(target, source.read_bytes())
+        write_file(target, source.read_bytes())
 
 
 def _open_executor(executor: Executor | None, scheduler: str | None) -> AbstractContextManager[Executor | None]:
@@ -358,7 +359,7 @@ def _make_shard(
 
     with _one_shard_at_a_time:
         data = encode_shard(make_samples(), shard.count, written, broken_files)
-    write_atomic(folder / shard.file, data)
+    write_file(folder / shard.file, data)
     entry = ShardEntry(shard.file, shard.first, shard.count, len(data), hashlib.sha256(data).hexdigest())
     return FinishedShard(entry, tuple(sorted(broken_files)))
 

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 from kpbench.dataset.card import CARD_FILES
 from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
 from kpbench.dataset.shard import canonical_json, open_shard, read_text_attribute
-from kpbench.errors import DataError
+from kpbench.errors import DataError, KpbenchWarning
 from kpbench.files import is_local, sha256_of
+from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
 LOCK_FILE = ".kpbench.lock"
 LONGEST_VALUE = 40
@@ -84,22 +87,24 @@ def prepare_folder(
     """
     manifest, names = folder / MANIFEST, {shard.file for shard in plan}
     entries = [path for path in folder.glob("*") if not path.name.startswith(".")]
-    present = [path for path in entries if fnmatch(path.name, "shard-*.h5")]
+    present = [path for path in entries if re.fullmatch(r"shard-\d{5,}\.h5", path.name)]
     if entries and not present and not manifest.exists():
         raise DataError(f"{folder}: holds other files ({entries[0].name}, ...), expected a new or an empty folder")
     planned = [path for path in present if path.name in names]
     is_whole = len(plan) == len(plan_shards(config["n"], config["shard_size"]))
     concerned = present if is_whole else planned
     if overwrite:
-        for path in [manifest, *(folder / name for name in CARD_FILES), *concerned]:
-            path.unlink(missing_ok=True)
+        for path in [manifest, *concerned]:
+            remove_file(path, "dataset")
+        for name, kind in zip(CARD_FILES, ("card", "picture"), strict=True):
+            if is_replaceable(folder / name, kind):
+                remove_file(folder / name, kind)
     elif not resume and (manifest.exists() or planned):
         problem = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
         remedy = "add `resume=True` to finish it, `overwrite=True` to replace it, or another `out`"
         raise DataError(f"{folder}: {problem}; {remedy}")
     for name in names:
-        for leftover in folder.glob(f".{name}.*.part"):  # from a run that was killed while writing
-            leftover.unlink(missing_ok=True)
+        remove_leftovers(folder / name)
     if overwrite or not resume:
         return {}
     for path in concerned:
@@ -221,16 +226,19 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         return
     path = folder / LOCK_FILE
     try:
-        file = path.open("w")
+        file = open(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+b")  # noqa: SIM115
     except OSError as error:
-        raise DataError(f"{path}: cannot be written, {error.strerror}") from None
+        reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
+        raise DataError(f"{path}: cannot be written, {reason}") from None
     with file:
         try:
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # deleted between open and flock
-                raise OSError
-        except OSError:
+                raise BlockingIOError
+        except (BlockingIOError, FileNotFoundError):
             raise DataError(f"{folder}: another kpbench run is writing to it") from None
+        except OSError:  # a file system without locks, such as some of the network
+            warnings.warn(f"{folder}: cannot be locked; let no other run write to it", KpbenchWarning, stacklevel=2)
         try:
             yield
         finally:

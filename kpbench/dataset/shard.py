@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.files import is_local
+from kpbench.files import is_local, note_read
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
@@ -204,6 +204,8 @@ def open_shard(path: Path) -> Any:
         datasets, or filters that are not built into HDF5.
     """
     with shard_errors(path):
+        if is_local(path):
+            note_read(path)
         file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
         with shard_errors(path):

@@ -10,10 +10,11 @@ import numpy as np
 from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import apply_effects, draw_effect
 from kpbench.errors import DataError
-from kpbench.files import make_folder, write_atomic
+from kpbench.files import make_folder
 from kpbench.images import ImageSource, encode_png, open_images, refuse_same_folder
 from kpbench.seeds import stream
 from kpbench.types import UInt8
+from kpbench.writing import write_file
 
 
 def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
@@ -97,7 +98,7 @@ def degrade_files(
         image = apply_effects(image, rng, effects)
         target = Path(out, name if name.endswith(".png") else f"{name}.png")
         make_folder(target.parent)
-        write_atomic(target, encode_png(image))
+        write_file(target, encode_png(image))
         yield target, effects
     if broken:
         raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")

@@ -21,6 +21,7 @@ from kpbench.detectors.inference import open_session, runs_on_gpu
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
 from kpbench.errors import DataError
+from kpbench.files import note_read
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
 from kpbench.types import Detections, Float, Float32, UInt8
@@ -239,6 +240,7 @@ class SuperPointDetector:
         ours = WEIGHTS / f"{self.shipped}{'' if runs_on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
+            note_read(self.path)
             self._session, text = open_session(self.path.read_bytes(), self.threads)
             content = json.loads(text or "{}")
         except DataError:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
+from kpbench.files import note_read
 from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
@@ -176,6 +177,7 @@ def open_coco(path: str | Path) -> CocoDataset:
     """
     path = Path(path)
     try:
+        note_read(path)
         data = path.read_bytes()
         with pause_gc():
             content = _decode_annotations(data)

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kpbench.errors import DataError, PredictionsError
-from kpbench.files import write_atomic
+from kpbench.files import note_read
 from kpbench.predictions import json_files, table_files
 from kpbench.predictions.decode import pause_gc
 from kpbench.types import Predictions
+from kpbench.writing import write_file
 
 READERS: dict[str, Callable[[Path], Predictions]] = {
     ".json": json_files.read_json,
@@ -61,6 +62,7 @@ def read_predictions(path: str | Path) -> Predictions:
     path = Path(path)
     try:
         suffix = _require_known_suffix(path)
+        note_read(path)
         with path.open("rb") as file:  # opened here, so that all formats have one message for a missing file
             if not file.read(1):
                 raise PredictionsError("the file is empty")
@@ -129,4 +131,4 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
         data = ENCODERS[path.suffix.lower()](predictions)
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
-    write_atomic(path, data)
+    write_file(path, data)

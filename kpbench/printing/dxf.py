@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from kpbench.geometry.outline import Arc, Contour
-from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
+from kpbench.printing.page import CUT, LAYERS, PRINT_MARK, Page, split_arc, start_point
 
 
 def to_dxf(page: Page) -> bytes:
@@ -41,7 +41,15 @@ def to_dxf(page: Page) -> bytes:
         body += [(0, "TEXT"), (5, f"{next(handle):X}"), (330, "1F"), (100, "AcDbEntity"), (8, "TEXT")]
         body += [(100, "AcDbText"), *place, (40, 0.7 * t.size), (1, _dxf_text(t.clean)), (71, 2 * t.mirrored)]
         body += [(72, side), *((code + 1, v) for code, v in place if side), (100, "AcDbText")]
-    tags = [*_dxf_head(page, next(handle)), (0, "SECTION"), (2, "ENTITIES"), *body, (0, "ENDSEC"), *DXF_END]
+    tags = [
+        (999, PRINT_MARK),
+        *_dxf_head(page, next(handle)),
+        (0, "SECTION"),
+        (2, "ENTITIES"),
+        *body,
+        (0, "ENDSEC"),
+        *DXF_END,
+    ]
     return "".join(f"{code:3d}\n{_dxf_value(value)}\n" for code, value in tags).encode("cp1252")
 
 

@@ -19,6 +19,8 @@ from kpbench.geometry.outline import Arc, Line, Region
 
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
+PRINT_MARK = "kpbench.print/1"
+"""Mark of a print, which lets :func:`kpbench.writing.write_file` replace the file."""
 
 
 @dataclass(frozen=True)

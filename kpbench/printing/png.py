@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.printing.font import png_font
-from kpbench.printing.page import CUT, Page, Text
+from kpbench.printing.page import CUT, PRINT_MARK, Page, Text
 
 MAX_PIXELS = 1_000_000_000
 
@@ -54,6 +54,7 @@ def to_png(page: Page, dpi: float) -> bytes:
     b'PNG'
     """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
 
     from kpbench.geometry.coverage import bounding_box, rasterise
 
@@ -81,7 +82,9 @@ def to_png(page: Page, dpi: float) -> bytes:
         letters, left, top = _letters(text, scale)
         ink(round(text.x * scale + left), round(text.y * scale + top), letters)
     out = io.BytesIO()
-    Image.fromarray(paper).save(out, "PNG", dpi=(scale * 25.4, scale * 25.4))
+    mark = PngInfo()
+    mark.add_text("Software", PRINT_MARK)
+    Image.fromarray(paper).save(out, "PNG", dpi=(scale * 25.4, scale * 25.4), pnginfo=mark)
     return out.getvalue()
 
 

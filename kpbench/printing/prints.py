@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from kpbench.errors import DesignError
-from kpbench.files import make_folder, write_atomic
+from kpbench.files import make_folder
 from kpbench.patches.board import Board
 from kpbench.patches.board_file import DEFAULT_DIAMETER_MM
 from kpbench.patches.design import Patch, shipped_patches
@@ -16,6 +16,7 @@ from kpbench.printing.formats import PAGE_WRITERS
 from kpbench.printing.page_format import PageFormat, parse_page_format
 from kpbench.printing.png import px_per_mm
 from kpbench.printing.sheet import Sheet, board_sheet, patch_sheet
+from kpbench.writing import write_file
 
 Progress = Callable[[int], None]
 
@@ -186,9 +187,9 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
         contents = PAGE_WRITERS[suffix](sheet.pages, dpi)
         for n, content in enumerate(contents, 1):
             written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
-            write_atomic(written[-1], content)
+            write_file(written[-1], content)
     written.append(folder / f"{stem}.json")
-    write_atomic(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
+    write_file(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
     return written
 
 

@@ -15,10 +15,10 @@ from typing import Any
 
 from kpbench import __version__
 from kpbench.errors import DesignError
-from kpbench.files import write_atomic
 from kpbench.patches.design import Patch
 from kpbench.printing.page import round_to_nm
 from kpbench.printing.page_format import PageFormat
+from kpbench.writing import write_file
 
 BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
@@ -95,7 +95,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
                 continue
             content = json.dumps(correct_sidecar(sidecar, measured_mm, str(path)), indent=1) + "\n"
             written.append(path.with_suffix(".measured.json"))
-            write_atomic(written[-1], content.encode())
+            write_file(written[-1], content.encode())
         except (KeyError, TypeError, ValueError) as error:
             raise DesignError(f"{path}: no complete sidecar ({type(error).__name__}: {error})") from None
         except OSError as error:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
 from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.score_charts import (
@@ -39,6 +38,7 @@ from kpbench.report.score_tables import (
 from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
+from kpbench.writing import write_file
 
 if TYPE_CHECKING:
     from kpbench.report.worst_cases import Case
@@ -305,6 +305,13 @@ def _share(row: Sequence[Cell], cell: Cell) -> int:
     return round(100 * cell / total) if isinstance(cell, int) and total else 0
 
 
+def _add_mark(suffix: str, text: str) -> str:
+    """Return a report with the mark that lets :func:`kpbench.writing.write_file` replace the file later."""
+    start, end = {".html": ("", ""), ".md": ("<!-- ", " -->\n\n"), ".tex": ("% ", "\n")}[suffix]
+    return f"{start}{REPORT_MARK}{end}{text}" if start else text
+
+
+REPORT_MARK = "kpbench.report/1"
 REPORT_WRITERS: dict[str, Callable[[Report], str]] = {
     ".html": to_html,
     ".md": to_markdown_report,
@@ -335,7 +342,7 @@ def write_report(path: str | Path, report: Report) -> None:
     """
     path = Path(path)
     require_report_suffix(path)
-    write_atomic(path, REPORT_WRITERS[path.suffix.lower()](report).encode())
+    write_file(path, _add_mark(path.suffix.lower(), REPORT_WRITERS[path.suffix.lower()](report)).encode())
 
 
 def require_report_suffix(path: Path) -> None:

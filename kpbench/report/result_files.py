@@ -19,6 +19,7 @@ from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
 
+TABLE_SCHEMA = "kpbench.table/1"
 COMPARISON_SCHEMA = "kpbench.comparison/1"
 """Name and version of the format of comparison files."""
 
@@ -62,7 +63,12 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
 
     Each row names the detector, the dataset and the version of kpbench, so that tables can be joined.
     """
-    about = {"detector": scores.name, "dataset": scores.fingerprint, "kpbench": provenance["kpbench"]}
+    about = {
+        "schema": TABLE_SCHEMA,
+        "detector": scores.name,
+        "dataset": scores.fingerprint,
+        "kpbench": provenance["kpbench"],
+    }
     rows = [about | row for row in scores.rows()]
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from kpbench import __version__
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
 from kpbench.patches.design import Patch
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe, parse_recipe
+from kpbench.writing import write_file
 
 SCHEMA = "kpbench.checkpoint/1"
 """Schema of the metadata in a checkpoint."""
@@ -105,7 +105,7 @@ def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) 
         "versions": {"kpbench": __version__, "torch": torch.__version__},
     }
     packed = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-    write_atomic(path, save(packed, {"kpbench": json.dumps(content)}))
+    write_file(path, save(packed, {"kpbench": json.dumps(content)}))
 
 
 def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

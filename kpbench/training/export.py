@@ -17,9 +17,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from kpbench.detectors.inference import open_session
 from kpbench.detectors.superpoint import CELL_PX, SCHEMA
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
 from kpbench.training.checkpoint import load_mean_network, read_checkpoint
 from kpbench.training.network import SuperPoint
+from kpbench.writing import write_file
 
 OPSET = 17
 """Version of the ONNX operators."""
@@ -135,7 +135,7 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     difference = largest_difference(data, image.numpy(), expected)
     if difference > MOST_DIFFERENCE:
         raise DataError(f"{out}: ONNX Runtime differs from PyTorch by {difference:.1e}, expected at most 1e-4")
-    write_atomic(Path(out), data)
+    write_file(Path(out), data)
     return Exported(len(data), content["step"], difference)
 
 

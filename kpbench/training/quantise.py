@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 from kpbench.detectors.inference import open_session
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
-from kpbench.files import write_atomic
+from kpbench.files import note_read
 from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
 from kpbench.training.export import Exported, largest_difference
+from kpbench.writing import write_file
 
 
 def export_int8(model: str | Path, out: str | Path) -> Exported:
@@ -52,6 +53,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     import onnx
 
     try:
+        note_read(model)
         data = Path(model).read_bytes()
         given = onnx.load_from_string(data)
         content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
@@ -71,7 +73,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     written = cast(bytes, quantised.SerializeToString())
     image = np.random.default_rng(0).random((1, 1, 72, 104), np.float32)
     difference = largest_difference(written, image, list(open_session(data)[0].run(None, {"image": image})))
-    write_atomic(Path(out), written)
+    write_file(Path(out), written)
     return Exported(len(written), content["step"], difference)
 
 

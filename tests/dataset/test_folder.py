@@ -11,8 +11,9 @@ from kpbench.dataset import folder
 from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard, open_shard
 from kpbench.errors import DataError
-from kpbench.files import sha256_of, write_atomic
+from kpbench.files import sha256_of
 from kpbench.types import KEYPOINT_DTYPE
+from kpbench.writing import write_file
 
 CONFIG = {"seed": 3, "kind": "test"}
 
@@ -34,7 +35,7 @@ def write_dataset(folder, counts=(4, 3), shape=(40, 50)):
     for k, count in enumerate(counts):
         data = encode_shard(samples(count, first, shape), count, CONFIG)
         path = folder / f"shard-{k:05d}.h5"
-        write_atomic(path, data)
+        write_file(path, data)
         entries.append(ShardEntry(path.name, first, count, len(data), sha256_of(path)))
         first += count
     write_manifest(folder, CONFIG, entries, {})
@@ -182,11 +183,11 @@ def test_nothing_is_kept_in_the_heap_of_variable_length_data(whole):
 
 def test_an_atomic_write_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    write_atomic(path, b"old")
+    write_file(path, b"kpbench.picture/1 old")
     monkeypatch.setattr(os, "fsync", lambda fd: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(DataError, match="the disk is full"):
-        write_atomic(path, b"new")
-    assert path.read_bytes() == b"old"
+        write_file(path, b"kpbench.picture/1 new")
+    assert path.read_bytes() == b"kpbench.picture/1 old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 

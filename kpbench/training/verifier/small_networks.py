@@ -15,11 +15,11 @@ from onnx.numpy_helper import to_array
 from torch import Tensor, nn
 
 from kpbench.detectors.verification import WEIGHTS
-from kpbench.files import write_atomic
 from kpbench.training.export import OPSET
 from kpbench.training.quantise import quantise
 from kpbench.training.verifier.dataset_images import progress_bar
 from kpbench.training.weights import restore_batchnorm
+from kpbench.writing import write_file
 
 WEIGHT_DECAY = 2e-2
 """Weight decay of AdamW."""
@@ -160,5 +160,5 @@ def write_network(
         )
     feeds = (dict(zip(inputs, (part.numpy() for part in one), strict=True)) for one in seen)
     data = bytes(quantise(onnx.load_from_string(buffer.getvalue()), feeds).SerializeToString())
-    write_atomic(file, data)
+    write_file(file, data)
     say(f"{file}: {len(data)} bytes")

@@ -1,0 +1,215 @@
+"""The one gate that files are written and removed through.
+
+1. A file appears whole or not at all.
+2. A file that exists is replaced only if kpbench wrote it, and only by a file of the same kind. A mark in each file
+   names the kind: a text such as ``kpbench.predictions/1``.
+3. A command never writes to a file that it reads.
+4. A symbolic link is followed. A device, a pipe or a socket is written through, and stays what it is.
+5. A new file gets its mode from the umask. A replaced file keeps its mode.
+"""
+
+from __future__ import annotations
+
+import errno
+import glob
+import os
+import re
+import secrets
+import shutil
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from kpbench.errors import DataError
+from kpbench.files import is_local, is_read
+
+MARK = re.compile(rb"kpbench\.([a-z-]+)/\d")
+USER_KINDS = ("board-design", "patch", "suite")
+"""Kinds of files that users write and kpbench only reads."""
+HEAD_BYTES, TAIL_BYTES = 65536, 16384
+"""A mark stands within so many bytes from the start of a file, or within so many bytes from its end."""
+
+
+def kind_of(head: bytes, tail: bytes = b"") -> str | None:
+    """Return the kind that the first mark of a file names; None if kpbench did not write the file."""
+    for part in (head, tail):
+        for found in MARK.finditer(part):
+            if (kind := found[1].decode()) not in USER_KINDS:
+                return kind
+    return None
+
+
+def write_file(path: Path, data: bytes | memoryview) -> None:
+    """Write a file whole or not at all.
+
+    On this machine: write a temporary file in the same folder, fsync the file, rename it, fsync the folder. At a URL:
+    put the file in one piece. Object stores write one piece whole or not at all.
+
+    Raises
+    ------
+    DataError
+        If the file exists and kpbench did not write it, or wrote it as a file of another kind; if the running command
+        reads the file; if the disk is full or the folder cannot be written. No other file is left behind.
+    """
+    if not is_local(path):
+        with _remote_errors(path):
+            path.write_bytes(bytes(data))
+        return
+    with _one_line_errors(path):
+        target, mode = _find_target(path)
+        if mode is not None and not stat.S_ISREG(mode):
+            with open(target, "wb") as device:
+                device.write(data)
+            return
+        if mode is not None:
+            if target.stat().st_size == len(data) and target.read_bytes() == data:
+                return
+            _require_replaceable(path, target, kind_of(bytes(data[:HEAD_BYTES]), bytes(data[-TAIL_BYTES:])))
+        part = target.with_name(f".{target.name}.{secrets.token_hex(4)}.part")
+        try:
+            with open(part, "xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            _put_in_place(part, target, mode)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(part)
+            raise
+
+
+def move_file(part: Path, path: Path) -> None:
+    """Put a finished file in the place of another, under the rules of :func:`write_file`.
+
+    ``part`` lies in the folder of ``path``, and is gone afterwards.
+
+    Raises
+    ------
+    DataError
+        As :func:`write_file`.
+    """
+    with _one_line_errors(path):
+        target, mode = _find_target(path)
+        if mode is not None and not stat.S_ISREG(mode):
+            with open(part, "rb") as file, open(target, "wb") as device:
+                shutil.copyfileobj(file, device)
+            return
+        if mode is not None:
+            _require_replaceable(path, target, kind_of(*_ends(part)))
+        with open(part, "rb") as file:
+            os.fsync(file.fileno())
+        _put_in_place(part, target, mode)
+
+
+def is_replaceable(path: Path, kind: str) -> bool:
+    """Return whether a file of this kind may be written to a path: no file is there, or one of the same kind."""
+    return not is_local(path) or not path.exists() or kind_of(*_ends(path)) == kind
+
+
+def require_writable(path: Path, kind: str) -> None:
+    """Refuse, before any work is done, a path that :func:`write_file` will refuse after the work.
+
+    Raises
+    ------
+    DataError
+        If there is no folder for the file, or the folder cannot be written, or the file must not be replaced.
+    """
+    if not is_local(path):
+        return
+    with _one_line_errors(path):
+        target, mode = _find_target(path)
+        if mode is not None and not stat.S_ISREG(mode):
+            return
+        if mode is not None:
+            _require_replaceable(path, target, kind)
+        if not target.parent.is_dir():
+            raise DataError(f"{path}: cannot be written, there is no folder {path.parent}")
+        if not os.access(target.parent, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+def remove_file(path: Path, kind: str) -> None:
+    """Remove a file that kpbench wrote as a file of this kind. A file that does not exist is no error.
+
+    Raises
+    ------
+    DataError
+        If kpbench did not write the file, or wrote it as a file of another kind.
+    """
+    try:
+        if is_local(path) and path.exists() and path.stat().st_size and kind_of(*_ends(path)) != kind:
+            raise DataError(f"{path}: would be removed, but kpbench did not write it; move it elsewhere")
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be removed, {error.strerror}") from None
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what a killed run left of a file: its unfinished parts."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        with suppress(OSError):
+            part.unlink()
+
+
+def _find_target(path: Path) -> tuple[Path, int | None]:
+    """Follow symbolic links; return the file that will be written, and its mode, None if it does not exist."""
+    target = Path(os.path.realpath(path))
+    try:
+        mode = target.stat().st_mode
+    except FileNotFoundError:
+        return target, None
+    if stat.S_ISDIR(mode):
+        raise DataError(f"{path}: cannot be written, it is a folder")
+    return target, mode
+
+
+def _require_replaceable(path: Path, target: Path, kind: str | None) -> None:
+    """Refuse to replace a file by a file of this kind if the running command reads the file, or if its kind differs."""
+    if is_read(target):
+        raise DataError(f"{path}: this command reads it; name another file to write")
+    if not target.stat().st_size:
+        return
+    old = kind_of(*_ends(target))
+    if old is None:
+        raise DataError(f"{path}: exists, and kpbench did not write it; name another file, or move it elsewhere")
+    if old != kind:
+        raise DataError(f"{path}: exists, and is a file of another kind (kpbench.{old}); name another file to write")
+
+
+def _put_in_place(part: Path, target: Path, mode: int | None) -> None:
+    if mode is not None:
+        os.chmod(part, stat.S_IMODE(mode))
+    os.replace(part, target)
+    with suppress(OSError):  # some file systems do not let a folder be opened
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def _ends(path: Path) -> tuple[bytes, bytes]:
+    """Return the first and the last bytes of a file."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+        file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL_BYTES))
+        return head, file.read()
+
+
+@contextmanager
+def _one_line_errors(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
+        raise DataError(f"{path}: cannot be written, {reason}") from None
+
+
+@contextmanager
+def _remote_errors(path: Path) -> Iterator[None]:
+    """Turn every error of a remote file system into one line."""
+    try:
+        yield
+    except Exception as error:
+        raise DataError(f"{path}: cannot be written ({' '.join(str(error).split())[:160]})") from None
