@@ -26,7 +26,7 @@ from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pos
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score
 from kpbench.types import Predictions, Truth, UInt8
-from kpbench.writing import write_file
+from kpbench.writing import require_writable, write_file
 
 DEFAULT_DATASET = Path("kpbench-data")
 """Default folder of ``kpbench synth``, and the truth if neither user nor file names a dataset that exists."""
@@ -195,7 +195,7 @@ def score_file(
     (1.0, 'kpbench-data')
     """
     path, (to_json, to_csv, to_report) = Path(predictions), map(_as_path, (json_file, csv_file, report_file))
-    _refuse_overwrite([path], [to_json, to_csv], to_report)
+    _refuse_overwrite([path], {"scores": to_json, "table": to_csv, "report": to_report})
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _compute_poses(scores, dataset) if pose else ()
     provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
@@ -250,7 +250,7 @@ def compare_files(
     if len(predictions) < 2:
         raise ValueError(f"{len(predictions)} predictions files, expected two or more")
     paths, to_json, to_report = [Path(file) for file in predictions], _as_path(json_file), _as_path(report_file)
-    _refuse_overwrite(paths, [to_json], to_report)
+    _refuse_overwrite(paths, {"comparison": to_json, "report": to_report})
     dataset, scores = _score_files(paths, truth, warn, options)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
     provenance = collect_provenance(dataset.path, dataset.fingerprint, paths, command)
@@ -265,11 +265,14 @@ def _as_path(file: str | Path | None) -> Path | None:
     return None if file is None else Path(file)
 
 
-def _refuse_overwrite(sources: Sequence[Path], targets: Sequence[Path | None], report: Path | None) -> None:
-    """Refuse files that cannot be written, before any work is done."""
-    if report:
+def _refuse_overwrite(sources: Sequence[Path], targets: Mapping[str, Path | None]) -> None:
+    """Refuse targets, by the kind of each, that cannot be written, before any work is done."""
+    if report := targets["report"]:
         require_report_suffix(report)
-    refuse_overwrite([*targets, report], sources)
+    refuse_overwrite(targets.values(), sources)
+    for kind, target in targets.items():
+        if target:
+            require_writable(target, kind)
 
 
 def _score_files(

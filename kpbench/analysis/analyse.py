@@ -14,7 +14,7 @@ from kpbench.analysis.search import SEARCH_STEPS, SearchResult, search_designs
 from kpbench.errors import DesignError
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.printing.formats import PAGE_WRITERS
-from kpbench.writing import write_file
+from kpbench.writing import require_writable, write_file
 
 FIGURE_DPI = 200.0
 """Resolution of a figure that is written as PNG."""
@@ -97,6 +97,9 @@ def analyse_patches(
     suffix = Path(figure_file or "a.svg").suffix.lower()
     if suffix not in FIGURE_SUFFIXES:
         raise DesignError(f"{figure_file}: expected a file that ends in {', '.join(FIGURE_SUFFIXES)}")
+    for file, kind in ((json_file, "analysis"), (figure_file, "print")):
+        if file is not None:
+            require_writable(Path(file), kind)
     windows = background_windows(backgrounds)
     found = search_designs(windows, shipped_patches(), progress=progress) if search_family else None
     measured = found.sets[0] if found else tuple(patches or shipped_patches())

@@ -69,12 +69,12 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     from kpbench.dataset.card import draw_overview
     from kpbench.dataset.folder import open_dataset
     from kpbench.images import encode_png
-    from kpbench.writing import write_file
+    from kpbench.writing import require_writable, write_file
 
     data = open_dataset(dataset)
-    sheet = draw_overview(data, count, columns, tile_width)
     target = out or data.path / "preview.png"
-    write_file(target, encode_png(sheet))
+    require_writable(target, "picture")
+    write_file(target, encode_png(draw_overview(data, count, columns, tile_width)))
     click.echo(str(target))
 
 

@@ -208,17 +208,8 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
       kpbench export-model runs/superpoint-small/checkpoint.safetensors --out superpoint-small.onnx
       kpbench export-model superpoint-small.onnx --int8 --out superpoint-small-int8.onnx
     """
-    from kpbench.errors import DataError
-    from kpbench.files import refuse_overwrite
-
     with _needs_torch("export-model"):
         from kpbench.training.export import export_onnx
         from kpbench.training.quantise import export_int8
-    if out.suffix != ".onnx":
-        raise DataError(f"{out}: expected a name ending in .onnx")
-    if int8 != (checkpoint.suffix == ".onnx"):
-        problem = "--int8 takes the .onnx file of export-model, not a checkpoint" if int8 else "is exported already"
-        raise DataError(f"{checkpoint}: {problem}; export a checkpoint without --int8, and an .onnx file with --int8")
-    refuse_overwrite([out], [checkpoint])
     done, other = (export_int8(checkpoint, out), "float32") if int8 else (export_onnx(checkpoint, out), "PyTorch")
     click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {other} by at most {done.difference:.1e}")

@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from kpbench.errors import DataError, PredictionsError
+from kpbench.errors import PredictionsError
 from kpbench.files import note_read
 from kpbench.predictions import json_files, table_files
 from kpbench.predictions.decode import pause_gc
 from kpbench.types import Predictions
-from kpbench.writing import write_file
+from kpbench.writing import require_writable, write_file
 
 READERS: dict[str, Callable[[Path], Predictions]] = {
     ".json": json_files.read_json,
@@ -82,15 +82,14 @@ def require_predictions_path(path: str | Path) -> Path:
     PredictionsError
         If the path does not end in .json, .jsonl, .csv, .parquet or .h5.
     DataError
-        If the folder does not exist.
+        If the folder does not exist or cannot be written, or if another file is there.
     """
     path = Path(path)
     try:
         _require_known_suffix(path)
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
-    if not path.parent.is_dir():
-        raise DataError(f"{path}: cannot be written, there is no folder {path.parent}")
+    require_writable(path, "predictions")
     return path
 
 

@@ -19,7 +19,7 @@ from kpbench.detectors.superpoint import CELL_PX, SCHEMA
 from kpbench.errors import DataError
 from kpbench.training.checkpoint import load_mean_network, read_checkpoint
 from kpbench.training.network import SuperPoint
-from kpbench.writing import write_file
+from kpbench.writing import require_writable, write_file
 
 OPSET = 17
 """Version of the ONNX operators."""
@@ -92,6 +92,13 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
     return cast(bytes, model.SerializeToString())
 
 
+def require_onnx_target(out: str | Path) -> None:
+    """Refuse a path that no ONNX file can be written to, before the work is done."""
+    if Path(out).suffix != ".onnx":
+        raise DataError(f"{out}: expected a name ending in .onnx")
+    require_writable(Path(out), "superpoint")
+
+
 def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     """Write the running mean of a checkpoint as an ONNX file, after a comparison of its outputs with PyTorch.
 
@@ -115,6 +122,7 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
     >>> export_onnx("runs/superpoint-small/checkpoint.safetensors", "small.onnx")  # doctest: +SKIP
     Exported(bytes=3633412, step=46875, difference=1.5e-05)
     """
+    require_onnx_target(out)
     content, tensors = read_checkpoint(checkpoint)
     network = load_mean_network(content, tensors)
     recipe = content["recipe"]

@@ -19,7 +19,7 @@ from kpbench.files import note_read
 from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
-from kpbench.training.export import Exported, largest_difference
+from kpbench.training.export import Exported, largest_difference, require_onnx_target
 from kpbench.writing import write_file
 
 
@@ -52,6 +52,7 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     """
     import onnx
 
+    require_onnx_target(out)
     try:
         note_read(model)
         data = Path(model).read_bytes()

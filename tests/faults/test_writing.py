@@ -113,7 +113,7 @@ def test_overwrite_and_resume_leave_what_the_user_put_into_a_dataset(tmp_path):
         generate(config, folder, workers=1, **options)
         assert {name: (folder / name).read_bytes() for name in mine} == mine
     (folder / "shard-00000.h5").write_bytes(b"mine")
-    with pytest.raises(DataError, match="shard-00000.h5: would be removed, but kpbench did not write it"):
+    with pytest.raises(DataError, match=r"shard-00000\.h5: would be removed, but kpbench did not write it"):
         generate(config, folder, workers=1, overwrite=True)
     assert (folder / "shard-00000.h5").read_bytes() == b"mine"
 

@@ -105,7 +105,7 @@ def test_find_patch_by_name_and_by_id():
         with pytest.raises(DesignError, match="is not known; known are: "):
             find_patch(PATCHES, key)
     twins = (PATCHES[0], dataclasses.replace(PATCHES[1], name=PATCHES[0].name))
-    with pytest.raises(DesignError, match="carried by two designs"):
+    with pytest.raises(DesignError, match="the name or ID of several designs"):
         find_patch(twins, PATCHES[0].name)
 
 
