@@ -2,8 +2,8 @@
 
 All results lie in one folder. The name of a dataset's folder contains a digest of the config and of kpbench's version.
 The path of a predictions file contains digests of the dataset and of the detector's version, settings and weights.
-So other inputs have other paths, and a file that exists is always valid. A detector without a version runs again at
-each call. Scoring takes seconds and is repeated at each call.
+So changed inputs change the path, and an existing file is always valid. A detector without a version runs again at each
+call. Scoring takes seconds and is repeated at each call.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from kpbench.workers import Progress, run_jobs
 from kpbench.writing import remove_file, write_file
 
 IMAGES_PER_PART = 32
-"""Number of images whose detections are kept in one file until all parts are joined."""
+"""Number of images in a part. Each part has a file of detections until all parts are joined."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class BenchRun:
         The predictions file.
     scores : Scores
     failures : tuple of (image_id, message)
-        Images on which the detector raised an error. They count as images without detections.
+        Images on which the detector raised an error. These images count as images without detections.
 
     Examples
     --------
@@ -87,7 +87,7 @@ class SuiteReport:
     tables : tuple of Table
         The main metrics over all images, the paper's tables with rows for the detectors, and the breakpoints.
     page : Path
-        The report, HTML.
+        The HTML report.
     scores_folder : Path
         Folder with one scores file per detector.
 
@@ -134,25 +134,25 @@ def bench(
     workers: int | None = None,
     progress: Progress = lambda images: None,
 ) -> list[BenchRun]:
-    """Run detectors over suites, each detector on its own board, and score them.
+    """Run detectors over suites and score the detectors. Each detector sees the suites on its own board.
 
     Parameters
     ----------
     suites : sequence of SuiteConfig
-        The field ``board`` is ignored.
+        The board of the detector replaces the field ``board``.
     detectors : sequence of str
         Names as for :func:`kpbench.load_detector`.
     out : str or Path
         Folder, new or of an earlier run. Finished work of an earlier run is kept.
     workers : int or None
-        Number of processes; None for one per core. It changes no result.
+        Number of processes; None for one per core. The number changes no result.
     progress : function
         Called with the number of images that were made, or shown to a detector, since the last call.
 
     Returns
     -------
     list of BenchRun
-        By suite, then by detector.
+        In the order of the suites, then of the detectors.
 
     Raises
     ------
@@ -260,7 +260,7 @@ def _detect_part(part: _Part, progress: Progress) -> None:
 
 
 def _describe_failures(failures: list[list[Any]]) -> dict[str, Any]:
-    """Return the field of a detector's description that lists the images on which it raised an error."""
+    """Return the field ``failures`` of a detector's description; an empty dict without failures."""
     return {"failures": failures} if failures else {}
 
 

@@ -31,7 +31,7 @@ class KpbenchError(Exception):
 
 
 class KpbenchWarning(UserWarning):
-    """Something that the user should know and that stops no work. The command line prints the warning in one line."""
+    """A problem that does not stop the work. The command line prints the warning in one line."""
 
 
 class DesignError(KpbenchError):

@@ -29,13 +29,15 @@ from kpbench.types import Predictions, Truth, UInt8
 from kpbench.writing import require_writable, write_file
 
 DEFAULT_DATASET = Path("kpbench-data")
-"""Default folder of ``kpbench synth``, and the truth if neither user nor file names a dataset that exists."""
+"""Default folder of ``kpbench synth``. Scoring uses the folder if no dataset is named or the named one is gone."""
 MOST_CASES = 12
 """Largest number of images in the galleries of a report, divided among its detectors."""
 
 
 class LabelledImages(Protocol):
-    """What scoring and reports use of a dataset: a :class:`kpbench.Dataset`, COCO annotations or your own class.
+    """The attributes of a dataset that scoring and reports need.
+
+    :class:`kpbench.Dataset` and COCO annotations have these attributes. A class of your own may have them too.
 
     Examples
     --------
@@ -57,7 +59,7 @@ class LabelledImages(Protocol):
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """How the images were made and the names of the patches; may be empty."""
+        """How the images were made, and the names of the patches; may be empty."""
         ...
 
     @property
@@ -66,7 +68,7 @@ class LabelledImages(Protocol):
         ...
 
     def image(self, index: int) -> UInt8:
-        """Read the image at a position of the truth, of shape (H, W) or (H, W, 3).
+        """Return the image at an index into the truth, as an array of shape (H, W) or (H, W, 3).
 
         Raises
         ------
@@ -122,7 +124,7 @@ class ComparedFiles:
     Attributes
     ----------
     comparisons : tuple of Comparison
-        Comparisons of the first file with each of the others.
+        Comparisons of the first file with every other file.
     scores : tuple of Scores
         The scores of each file.
     dataset : LabelledImages
@@ -166,13 +168,14 @@ def score_file(
         Folder of a dataset, COCO annotations (.json) or an open dataset. None takes the dataset that the predictions
         name, else the folder ``kpbench-data``.
     pose : bool
-        Whether to compute errors of the board's pose too. The dataset must be made from a suite.
+        Whether to compute errors of the board's pose also. The dataset must be made from a suite.
     json_file, csv_file, report_file : str, Path or None
         Files to write: all scores as JSON, one row per group as CSV, and a report (.html, .md or .tex).
     command : sequence of str
         The command line, for the provenance.
     warn : function
-        Called with a line of text if the images for the report or the dataset that the predictions name are missing.
+        Called with a line of text if the images for the report are missing, or if the dataset that the predictions
+        name is missing.
     **options
         The keyword arguments of :func:`kpbench.score`, such as ``eps=0.2``.
 
@@ -185,7 +188,7 @@ def score_file(
     PredictionsError
         If the predictions cannot be read or do not fit the dataset.
     DataError
-        If the dataset cannot be read, a file cannot be written, or `pose` is set and the dataset shows no known board.
+        If the dataset cannot be read, a file cannot be written, or `pose` is True and the dataset shows no known board.
 
     Examples
     --------
@@ -218,7 +221,7 @@ def compare_files(
     warn: Callable[[str], None] = warnings.warn,
     **options: Unpack[ScoreOptions],
 ) -> ComparedFiles:
-    """Compare the first of several predictions files with each of the others, on the same truth.
+    """Compare the first of several predictions files with every other file, on the same truth.
 
     Parameters
     ----------
@@ -238,7 +241,7 @@ def compare_files(
     ValueError
         If there are fewer than two files.
     PredictionsError, DataError
-        As by :func:`score_file`.
+        As raised by :func:`score_file`.
 
     Examples
     --------
@@ -266,7 +269,10 @@ def _as_path(file: str | Path | None) -> Path | None:
 
 
 def _refuse_overwrite(sources: Sequence[Path], targets: Mapping[str, Path | None]) -> None:
-    """Refuse targets, by the kind of each, that cannot be written, before any work is done."""
+    """Raise an error, before any work is done, if a target cannot be written or is a source.
+
+    The keys of ``targets`` are the kinds of the files.
+    """
     if report := targets["report"]:
         require_report_suffix(report)
     refuse_overwrite(targets.values(), sources)
@@ -303,7 +309,7 @@ def _score_files(
 def _find_dataset(
     predictions: Predictions, file: Path, truth: str | Path | LabelledImages | None, warn: Callable[[str], None]
 ) -> LabelledImages:
-    """Open the dataset that the user names, else the one that the file names, else ``kpbench-data``."""
+    """Open the dataset ``truth``, else the dataset that the predictions name, else ``kpbench-data``."""
     if truth is not None:
         if not isinstance(truth, str | Path):
             return truth

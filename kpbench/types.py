@@ -79,14 +79,14 @@ class Detections:
         assign(self, "xy", xy.reshape(-1, 2))
         assign(self, "score", np.asarray(self.score, np.float64).reshape(-1))
         if len(self.score) != len(self.xy):
-            raise ValueError(f"{len(self.xy)} points have {len(self.score)} scores, expected as many")
+            raise ValueError(f"{len(self.xy)} points have {len(self.score)} scores, expected one per point")
         if self.patch_id is not None:
             ids = np.asarray(self.patch_id)
             if ids.size and not (np.isfinite(ids) & (ids == np.rint(ids))).all():
                 raise ValueError("patch_id holds numbers that are not whole")
             assign(self, "patch_id", ids.astype(np.int64).reshape(-1))
             if ids.size != len(self.xy):
-                raise ValueError(f"{len(self.xy)} points have {ids.size} patch IDs, expected as many")
+                raise ValueError(f"{len(self.xy)} points have {ids.size} patch IDs, expected one per point")
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -105,7 +105,7 @@ class Detections:
 
 @dataclass(frozen=True)
 class Truth:
-    """True keypoints of N images as one table; image ``i`` owns the rows ``offsets[i]:offsets[i + 1]``.
+    """True keypoints of N images as one table. The rows of image ``i`` are ``offsets[i]:offsets[i + 1]``.
 
     Attributes
     ----------
@@ -116,7 +116,7 @@ class Truth:
     keypoints : ndarray of shape (offsets[-1],), KEYPOINT_DTYPE
         One record per true keypoint.
     condition : ndarray of shape (N,), str
-        Name of the condition that an image belongs to; "" for none.
+        Name of the condition of each image; "" for none.
     rung : ndarray of shape (N,), float64
         Severity within the condition; nan for none.
     scene_id : ndarray of shape (N,), int64
@@ -168,7 +168,7 @@ class InvalidValue(PredictionsError):
 
 @dataclass(frozen=True)
 class Predictions:
-    """Detections of N images as columns; image ``i`` owns the rows ``offsets[i]:offsets[i + 1]``.
+    """Detections of N images as columns. The rows of image ``i`` are ``offsets[i]:offsets[i + 1]``.
 
     Attributes
     ----------
@@ -187,7 +187,7 @@ class Predictions:
     dataset : str or None
         Path or fingerprint of the dataset.
     fingerprint : str or None
-        Fingerprint of the dataset. The evaluator compares the fingerprint with the dataset's own.
+        Fingerprint of the dataset. Scoring compares this fingerprint with the fingerprint of the truth.
 
     Raises
     ------
@@ -236,12 +236,12 @@ class Predictions:
         dataset: str | None = None,
         fingerprint: str | None = None,
     ) -> Predictions:
-        """Return the columns for one :class:`Detections` per image.
+        """Make predictions from one :class:`Detections` per image.
 
         Parameters
         ----------
         detections : iterable of Detections
-            One element per image. All elements have identities, or none has.
+            One element per image. All or none of the elements with detections have identities.
         image_id : sequence of int, optional
             0, 1, 2, … if left out.
         detector, dataset, fingerprint
@@ -250,7 +250,7 @@ class Predictions:
         Raises
         ------
         PredictionsError
-            As :class:`Predictions`, and if some images with detections have identities and others have none.
+            As raised by :class:`Predictions`, or if only some of the elements with detections have identities.
         """
         found = list(detections)
         named = [d.patch_id is not None for d in found if len(d)]

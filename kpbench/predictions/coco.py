@@ -1,4 +1,4 @@
-"""COCO keypoints: annotations as truth, for images that kpbench did not make, and results as predictions."""
+"""Read COCO annotations as truth (for images that kpbench did not make), and COCO results as predictions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]
-"""Number of a category: a patch ID plus 1."""
+"""ID of a category: the patch ID plus 1."""
 Point = tuple[float, float, float]
 """Place x, y in px, and COCO's visibility v; v = 0 means "not labelled"."""
 
@@ -120,7 +120,7 @@ class CocoDataset:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint that the annotations file names, else the SHA-256 of the annotations file."""
+        """Fingerprint in the annotations file; the SHA-256 of the file if the file holds no fingerprint."""
         return self.truth.fingerprint
 
     @property
@@ -129,7 +129,7 @@ class CocoDataset:
         return {}
 
     def image(self, index: int) -> UInt8:
-        """Read the image at a position, uint8 of shape (H, W, 3), RGB.
+        """Return the image at an index into the truth, as uint8 of shape (H, W, 3), RGB.
 
         Raises
         ------
@@ -251,7 +251,7 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
         if annotations[n].radius is None and annotations[n].radius_major is None:
             raise DataError(
                 f"annotations[{n}] (image_id {annotations[n].image_id}): has no radius, "
-                "expected the disc's in px as radius, or radius_major and radius_minor"
+                "expected radius, or radius_major and radius_minor, in px"
             )
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
@@ -299,7 +299,7 @@ def decode_coco_results(data: bytes) -> Predictions:
         if frame != []:
             raise ValueError
         parts = [_to_columns(batch) for batch in decode_records(pieces, CocoResult, EXPECTED_IN_COCO, place)]
-    except (ValueError, RecursionError):  # entries with objects cannot be split: decode all at once, and find any fault
+    except (ValueError, RecursionError):  # the list cannot be split: decode the file at once, and find any fault
         entries = parse_json(data, "the file")
         if not isinstance(entries, list):
             raise PredictionsError(f"holds {json_type(entries)}, expected a list of COCO keypoint results") from None

@@ -1,7 +1,7 @@
-"""Decode JSON into typed records, a part of a long list at a time, and describe the first fault in one line.
+"""Decode JSON into typed records, a long list piece by piece, and describe the first fault in one line.
 
-Decoding into typed records makes no dictionaries. A file is decoded again, into plain objects, only if it has a fault
-or its list cannot be split. The second decoding finds the place of the fault.
+Decoding into typed records makes no dictionaries. If a file has a fault or its list cannot be split, the file or the
+piece is decoded again into plain objects. The second decoding finds the place of the fault.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Place = Callable[[int], str]
 def split_list(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
     """Split the long list of a JSON text into shorter lists.
 
-    Decoded at once, the list would take several times the memory of its text. The split is at closing braces, so the
-    records of the list must not contain objects. No other list may follow in the text.
+    A list that is decoded at once takes several times the memory of its text. The list is split at closing braces, so
+    its records must not contain objects. No other list may follow in the text.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ def convert_records(entries: list[Any], record: type[Record], expected: Expected
     Raises
     ------
     PredictionsError
-        At the first record with a fault. The message names the record, its image, the field, the value and what was
-        expected.
+        At the first record with a fault. The message names the record, its image, the field, the value and the
+        expected value.
     """
     try:
         return msgspec.convert(entries, list[record])  # type: ignore[valid-type]

@@ -1,4 +1,4 @@
-"""The fields of a predictions file: of its header, of an image in JSON, and of the tables."""
+"""The fields of predictions files: keys of the header, keys of an image in JSON, and columns of tables."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
 TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
 """Columns of CSV and Parquet; score and id are optional."""
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
-"""HDF5 datasets of a file, and whether each holds whole numbers (i) or any numbers (f). score and id are optional."""
+"""HDF5 datasets of a file: "i" holds whole numbers, "f" holds any numbers; score and id are optional."""
 Int64 = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 
 
@@ -61,7 +61,7 @@ def parse_header(content: Any) -> dict[str, Any]:
         raise PredictionsError(f"dataset is {json_type(dataset)}, expected a path or a fingerprint")
     fingerprint = content.get("fingerprint")
     if not isinstance(fingerprint, str | None):
-        raise PredictionsError(f"fingerprint is {json_type(fingerprint)}, expected that of a dataset")
+        raise PredictionsError(f"fingerprint is {json_type(fingerprint)}, expected the fingerprint of a dataset")
     return {"detector": detector, "dataset": dataset, "fingerprint": fingerprint}
 
 

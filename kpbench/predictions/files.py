@@ -1,8 +1,8 @@
 """Read and write predictions files: the detections of a detector in every image of a dataset.
 
-In memory the predictions are columns (:class:`kpbench.Predictions`), so that a million images are a few arrays. On disk
-they are ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``, all with the same
-content. ``docs/reference/predictions-format.md`` describes each format.
+In memory the predictions are columns (:class:`kpbench.Predictions`), so that a million images need only a few arrays. A
+file is ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``. All formats hold the
+same content. ``docs/reference/predictions-format.md`` describes each format.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def require_predictions_path(path: str | Path) -> Path:
     PredictionsError
         If the path does not end in .json, .jsonl, .csv, .parquet or .h5.
     DataError
-        If the folder does not exist or cannot be written, or if another file is there.
+        If the folder does not exist or cannot be written, or if the path is a file other than predictions by kpbench.
     """
     path = Path(path)
     try:
@@ -113,9 +113,10 @@ def write_predictions(path: str | Path, predictions: Predictions) -> None:
     Raises
     ------
     PredictionsError
-        If the path ends in none of these suffixes, or if the format needs pyarrow and pyarrow is not installed.
+        If the path has another suffix, or if the format needs pyarrow and pyarrow is not installed.
     DataError
-        If the disk is full, or the folder does not exist or cannot be written.
+        If the disk is full, the folder does not exist or cannot be written, or the path is a file other than
+        predictions by kpbench.
 
     Examples
     --------

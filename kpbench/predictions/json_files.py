@@ -127,7 +127,7 @@ def _combine(batches: Iterable[list[ImageRecord]], header: dict[str, Any], place
     whole = _Batch(*columns)
 
     def has_values(name: str, counts: Int) -> bool:
-        """Check that all images with keypoints have the list, or none. Return whether they have the list."""
+        """Check that all or none of the images with keypoints have the list. Return whether all have the list."""
         wrong = np.flatnonzero((counts >= 0) & (counts != whole.keypoint_count))
         lacking = np.flatnonzero((counts < 0) & (whole.keypoint_count > 0))
         if len(wrong):

@@ -32,7 +32,7 @@ def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], pl
         The columns of :data:`TABLE_COLUMNS`. nan marks a blank cell. A row with only an image_id is an image
         without keypoints.
     header : dict
-        Further fields of the predictions.
+        Detector, dataset and fingerprint, as fields of :class:`kpbench.Predictions`.
     place : function
         Names the n-th row.
 
@@ -86,7 +86,7 @@ def _make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
 
 
 def _check_columns(names: list[str], place: str) -> list[str]:
-    """Strip and check the names of a table's columns, and return them."""
+    """Check the names of a table's columns, and return the names without blanks at the ends."""
     names = [name.strip() for name in names]
     if not {"image_id", "x", "y"} <= set(names) <= set(TABLE_COLUMNS) or len(set(names)) < len(names):
         raise PredictionsError(
@@ -99,7 +99,7 @@ def _check_columns(names: list[str], place: str) -> list[str]:
 
 
 def read_csv(path: Path) -> Predictions:
-    """Read a ``.csv`` file: one row per keypoint. The first line may be ``#`` and the predictions' header.
+    """Read a ``.csv`` file: one row per keypoint. The first line may be a ``#`` followed by the header.
 
     Raises
     ------
@@ -282,7 +282,7 @@ def read_h5(path: Path) -> Predictions:
 
 
 def _to_bytes(text: object) -> bytes:
-    """Return the text of an HDF5 attribute: h5py gives bytes for a fixed and str for a variable length."""
+    """Return the text of an HDF5 attribute: h5py gives bytes for text of fixed length, else str."""
     return text if isinstance(text, bytes) else str(text).encode()
 
 

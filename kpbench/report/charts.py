@@ -23,7 +23,7 @@ svg.chart{font:12px system-ui,sans-serif;color:inherit;width:100%;max-width:600p
 .chart .axis{stroke:currentColor;stroke-opacity:.5}.chart polyline{fill:none;stroke-width:2;stroke-linejoin:round}
 .chart .dashed{stroke-dasharray:5 4}.chart .band{stroke:none;fill-opacity:.16}
 """ + "".join(f".s{n}{{stroke:var(--s{n});fill:var(--s{n})}}" for n in range(CHART_COLOURS))
-"""Style sheet (CSS) of all charts of a page."""
+"""Style sheet (CSS) for all charts of a page."""
 
 # Sizes and positions are in SVG user units; a browser shows a chart at most 600 px wide
 CHART_WIDTH, CHART_HEIGHT = 480, 300
@@ -50,7 +50,7 @@ class Series:
     interval : sequence of (low, high) or None, optional
         A band around the line; None leaves a gap.
     style : int
-        Number of the line's colour, from 0.
+        Index of the line's colour, from 0.
     dashed : bool
 
     Examples
@@ -88,12 +88,12 @@ def line_chart(
     y_range : (low, high), optional
         Default: from 0 to a little over the largest value.
     x_ticks : sequence of float, optional
-        Positions of the numbers on the x-axis. The axis extends to the first and the last position. Default: about
-        five round numbers.
+        Positions of the numbers on the x-axis. The axis spans these positions and all points of the lines. Default:
+        about five round numbers.
     log_x : bool
         Whether the x-axis is logarithmic. Then all x must be positive.
     markers : bool
-        Whether each point has a dot with its numbers as a tooltip.
+        Whether each point is a dot with a tooltip that shows the numbers.
 
     Returns
     -------
@@ -182,7 +182,7 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
     kinds : sequence of str
         Names of the parts of a bar.
     styles : sequence of int
-        Colour of each part, by its number from 0.
+        Index of each part's colour, from 0.
 
     Returns
     -------

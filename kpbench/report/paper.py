@@ -1,7 +1,7 @@
 """The numbers of the paper's tables (arXiv:2410.00521).
 
-The paper's suite was photographed; kpbench's suite is simulated. The title of every
-table with numbers of both suites says how the images were made.
+The paper's images are photographs, and kpbench's images are simulated. A table that shows numbers from both says so in
+its title.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class PaperTable:
     condition : str
         Name of the same condition in the suite ``paper-v1``.
     title, unit : str
-        Name and unit of the rungs.
+        Name and unit of the quantity that changes from rung to rung.
     rungs : tuple of float
     detection_score, id_matching_score, average_false_alarm : tuple of float
         One value per rung.
@@ -113,11 +113,11 @@ SYNTHETIC = {
 }
 """The paper's table 2 (synthetic validation set), by the value of `deteriorate` in :class:`kpbench.SynthConfig`."""
 SYNTHETIC_RADIUS_PX = (5.0, 80.0)
-"""Smallest and largest radius, px, of a synthetic set that is comparable with table 2: the defaults."""
+"""Default limits of the radius, px. Only a synthetic set with these limits is comparable with table 2."""
 
 
 def paper_value(condition: str | None, rung: float | None, metric: str) -> float | None:
-    """Return a number of the paper's tables 3 to 7, or None if the tables have no such number.
+    """Return a value from the paper's tables 3 to 7, or None if the tables have no such value.
 
     Examples
     --------

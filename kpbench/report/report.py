@@ -1,6 +1,6 @@
 """Report the scores of one or several detectors on one dataset: HTML in one offline file, Markdown, LaTeX.
 
-:func:`make_sections` makes the content of a report. A function per form renders the content.
+:func:`make_sections` makes the content of a report. One function per format renders the content.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Report:
 
     @property
     def patch_names(self) -> dict[int, str]:
-        """Names, by patch ID, of the patches that the config names."""
+        """Names of the patches in the config, by patch ID."""
         return {int(patch["id"]): str(patch["name"]) for patch in self.config.get("patches", ())}
 
 
@@ -200,7 +200,7 @@ def _identity_section(report: Report) -> Section:
     return Section(
         "Identities",
         "Matched detections: true IDs in rows, detected IDs in columns. The column “other” counts IDs that no true "
-        "keypoint has, and detections that give two IDs to one place.",
+        "keypoint has, and matches with two different IDs at one place and one score.",
         tuple(confusion_table(run, report.patch_names) for run in report.runs if run.confusion),
     )
 
@@ -209,8 +209,8 @@ def _worst_cases_section(report: Report) -> Section:
     galleries = (Gallery(run.name, cases) for run, cases in zip(report.runs, report.cases, strict=True))
     return Section(
         "Worst cases",
-        "The images with the most failures, up to the same number of images per condition. Ellipses are true "
-        "keypoints, crosses are detections, numbers are detected IDs.",
+        "The images with the most failures. All conditions have the same limit on the number of images. Ellipses are "
+        "true keypoints, crosses are detections, numbers are detected IDs.",
         tuple(galleries) if report.cases else (),
     )
 
@@ -326,7 +326,7 @@ def write_report(path: str | Path, report: Report) -> None:
     Parameters
     ----------
     path : str or Path
-        The suffix selects the form: .html, .md or .tex.
+        The suffix selects the format: .html, .md or .tex.
     report : Report
 
     Raises
@@ -351,7 +351,7 @@ def require_report_suffix(path: Path) -> None:
     Raises
     ------
     DataError
-        If the path ends in none of these suffixes.
+        If the path does not end in .html, .md or .tex.
     """
     if path.suffix.lower() not in REPORT_WRITERS:
         raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_WRITERS)}")

@@ -59,7 +59,7 @@ def _encode_json(content: Mapping[str, Any]) -> bytes:
 
 
 def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
-    """Encode scores as CSV, one row per group. The first row is over all images.
+    """Encode scores as CSV, one row per group. The first row is the group of all images.
 
     Each row names the detector, the dataset and the version of kpbench, so that tables can be joined.
     """

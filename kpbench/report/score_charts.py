@@ -13,7 +13,7 @@ from kpbench.scoring.metrics import LABELS
 from kpbench.scoring.scores import Scores
 
 PAPER_STYLE = 7
-"""Number of the colour of the paper's lines: grey."""
+"""Index of the colour of the paper's lines, grey."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Figure:
     svg : str
         The chart, an ``<svg>`` element.
     legend : tuple of (name, style)
-        Name and number of the colour of each series.
+        Name and colour index of each series.
 
     Examples
     --------
@@ -109,8 +109,8 @@ def eps_chart(runs: Sequence[Scores]) -> Figure:
 def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
     """Draw a metric over the radius of the true keypoints' discs.
 
-    The point of a bin is midway between its edges. The last bin has no upper edge, so its point is at 1.5 times the
-    lower edge.
+    Each bin of radii is a point midway between the edges of the bin. The last bin has no upper edge, so its point is at
+    1.5 times the lower edge.
     """
     series = []
     for n, run in enumerate(runs):
@@ -131,7 +131,7 @@ def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
 
 
 def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:
-    """Draw two charts, the outcomes of true keypoints and the outcomes of detections, with one bar per detector."""
+    """Draw the outcomes of true keypoints, and in a second chart the outcomes of detections. A bar is a detector."""
     keypoints: tuple[str, ...] = ("found with the right ID", "found with a wrong ID", "missed")
     if any(run.overall.counts["id_correct"] is None for run in runs):
         keypoints = ("found", "missed")

@@ -44,7 +44,7 @@ def overview_table(runs: Sequence[Scores]) -> Table:
 
 
 def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simulated") -> Table:
-    """Tabulate the metrics of detectors below one of the paper's tables, with one column per rung.
+    """Tabulate the values of one of the paper's tables and the metrics of detectors, with one column per rung.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def paper_table(runs: Sequence[Scores], table: PaperTable, images: str = "simula
 
 
 def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate | None:
-    """Return an estimate minus the paper's value. The paper gives no intervals, so the interval keeps its width."""
+    """Return an estimate minus the paper's value. The paper's value has no interval, so the width stays the same."""
     if estimate is None or estimate.value is None or paper is None:
         return None
     interval = estimate.interval
@@ -91,7 +91,7 @@ def _subtract_paper(estimate: Estimate | None, paper: float | None) -> Estimate 
 
 
 def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
-    """Tabulate detectors below the paper's table 2. ``deteriorate``, "none" or "paper", selects the column."""
+    """Tabulate the paper's table 2 and detectors. ``deteriorate`` ("none" or "paper") is the detectors' column."""
     rows: list[tuple[Cell, ...]] = []
     for metric in PAPER_METRICS:
         rows.append((SHORT_LABELS[metric], "paper", "its own simulation", *(SYNTHETIC[k][metric] for k in SYNTHETIC)))
@@ -102,7 +102,7 @@ def synthetic_table(runs: Sequence[Scores], deteriorate: str) -> Table:
         "Synthetic validation set (paper: its own simulation; ours: simulated)",
         ("metric", "detector", "images", "without deterioration", "with deterioration"),
         tuple(rows),
-        "Paper: table 2 of arXiv:2410.00521. The paper's images are not ours.",
+        "Paper: table 2 of arXiv:2410.00521. The paper and kpbench simulate different images.",
     )
 
 
@@ -140,8 +140,8 @@ def breakpoint_table(runs: Sequence[Scores], limit: float = DETECTION_SCORE_LIMI
         f"Where the detection score crosses {limit:g}",
         ("detector", *names),
         tuple(rows),
-        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes. The "
-        "intervals end at the first or the last rung at the latest.",
+        "Crossings are interpolated linearly between rungs. Brackets hold 95 % intervals from resampled scenes. No "
+        "interval extends beyond the first or the last rung.",
     )
 
 
@@ -160,8 +160,8 @@ def group_table(
 ) -> Table:
     """Tabulate the main metrics of groups, one row per group.
 
-    Condition, rung, patch and radius each have a column if some group names a value. Each of the paper's
-    formulas as printed has a column if, in some group, its value differs from the metric of one-to-one matching.
+    Condition, rung, patch and radius have a column if at least one group has a value. A metric as printed in the paper
+    (``_literal``) has a column if its value differs from the metric without ``_literal`` in at least one group.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
 
 
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:
-    """Tabulate differences over all images and counts of verdicts over rungs: a row per other detector and metric.
+    """Tabulate differences over all images, and verdicts counted over rungs: a row per other detector and metric.
 
     Examples
     --------
@@ -259,7 +259,7 @@ def verdict_table(comparisons: Sequence[Comparison]) -> Table:
 
 
 def difference_table(comparison: Comparison) -> Table:
-    """Tabulate first minus second: a row for all images, then a row per condition and rung.
+    """Tabulate the differences of a comparison: a row for all images, then a row per condition and rung.
 
     Examples
     --------

@@ -15,7 +15,8 @@ from kpbench.scoring.scores import Scores
 def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
     """Write the settings, counts and metrics of a detector, and its tables of IDs, groups and poses.
 
-    A formula of the paper as printed is left out if it agrees with one-to-one matching in all groups.
+    A metric as printed in the paper (``_literal``) is left out if it equals the metric without ``_literal`` in all
+    groups.
 
     Parameters
     ----------
@@ -59,7 +60,7 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
 
 
 def summarise_comparisons(comparisons: Sequence[Comparison]) -> str:
-    """Write the verdicts on the first detector against each of the others, and all differences.
+    """Write the verdicts on the first detector against every other detector, and all differences.
 
     Examples
     --------

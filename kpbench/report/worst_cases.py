@@ -15,12 +15,12 @@ from kpbench.scoring.outcomes import Outcomes
 from kpbench.types import UInt8
 
 MOST_SIDE_PX = 800
-"""Longest side of a picture in the gallery; larger images are shrunk."""
+"""Largest width and height of a picture in the gallery, px. Larger images are shrunk."""
 JPEG_QUALITY = 82
-"""Quality of a picture in the gallery, of 100."""
+"""JPEG quality of a picture in the gallery, from 0 to 100."""
 NAME_OF_KIND = {MATCHED: "matched", DUPLICATE: "duplicate", NEAR_MISS: "near miss", CLUTTER: "clutter"}
 FAILURES = ("missed", "wrong ID", "duplicate", "near miss", "clutter")
-"""Names of the failures that are counted in an image."""
+"""The kinds of failures in an image."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Mark:
         For a true keypoint: "matched", "wrong ID" or "missed". For a detection: "matched", "wrong ID", "duplicate",
         "near miss" or "clutter".
     label : str
-        Identity, "" if unknown.
+        Patch ID; "" if unknown.
     axes : (major, minor) or None
         Semi-axes of a true keypoint's disc, px. None for a detection.
     angle : float
@@ -71,7 +71,8 @@ class Case:
         The picture.
     truth, detections : tuple of Mark
     failures : dict of str to int
-        Number of each failure in the image: "missed", "wrong ID", "duplicate", "near miss", "clutter".
+        Number of failures of each kind that occurs in the image: "missed", "wrong ID", "duplicate", "near miss" or
+        "clutter".
 
     Examples
     --------
@@ -94,13 +95,13 @@ class Case:
 def pick_worst_cases(outcomes: Outcomes, image: Callable[[int], UInt8], count: int = 12) -> tuple[Case, ...]:
     """Pick the images with the most failures, worst first.
 
-    Each condition has at most ``count`` / (number of conditions) images, rounded up.
+    At most ``count`` / (number of conditions) images of each condition, rounded up, are picked.
 
     Parameters
     ----------
     outcomes : Outcomes
     image : function
-        Function that reads the image at a position in the truth, uint8 of shape (H, W) or (H, W, 3) RGB.
+        Function that takes an index into the truth, and returns the image as uint8, (H, W) grey or (H, W, 3) RGB.
     count : int
         Largest number of images. Images without failures are not picked.
 

@@ -1,8 +1,8 @@
 """Match detections to true keypoints one to one, in all images at once.
 
-The best of all one-to-one assignments is taken: the most matches, then the highest scores, then the smallest
-distances, then the lowest place in (x, y). Identities do not influence the matches, and neither does the order of
-images, keypoints and detections.
+The best one-to-one assignment has the most matches, then the highest scores, then the smallest sum of distances. If
+several assignments are equally good, x decides, then y. Identities do not influence the matches. The order of images,
+keypoints and detections does not influence the matches.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from scipy.sparse.csgraph import connected_components
 from kpbench.types import Float, Int
 
 MATCHED, DUPLICATE, NEAR_MISS, CLUTTER = range(4)
-"""The kinds of a detection, see :class:`Matches`."""
+"""The kinds of detections, see :attr:`Matches.kind`."""
 PAIRS_PER_BLOCK = 2_000_000
-"""Approximate number of candidate pairs whose distances are in memory at a time."""
+"""Approximate largest number of candidate pairs that are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class TruthPoints:
     radius : ndarray of shape (T,), float64
         Radius of the keypoint's disc, px. The matching threshold is given in radii.
     image : ndarray of shape (T,), int64
-        Number of the image, 0 or more.
+        Index of the image, from 0.
 
     Examples
     --------
@@ -63,7 +63,7 @@ class DetectionPoints:
     score : ndarray of shape (D,), float64
         Confidence; a higher score is more confident.
     image : ndarray of shape (D,), int64
-        Number of the image, 0 or more.
+        Index of the image, from 0.
     patch_id : ndarray of shape (D,), int64, or None
         Detected identity. Only :attr:`Matches.contradicted` depends on it.
 
@@ -89,17 +89,18 @@ class Matches:
     Attributes
     ----------
     detection : ndarray of shape (T,), int64
-        Row of the detection that is matched to the true keypoint, or -1.
+        Row of the detection that is matched to the true keypoint; -1 without a match.
     distance : ndarray of shape (T,), float64
         Distance to the matched detection, px; nan without a match.
     contradicted : ndarray of shape (T,), bool
-        Whether a second detection has the place and the score of the matched detection, but another identity. The
-        order of the detections must not decide between the two identities.
+        Whether a second detection has the place and the score of the matched detection, but another identity.
+        Neither identity is then correct, because the order of the detections must not decide between the two.
     nearest : ndarray of shape (D,), int64
-        Row of the nearest true keypoint within the matching threshold, or -1.
+        Row of the nearest true keypoint within the matching threshold; -1 without such a keypoint.
     kind : ndarray of shape (D,), uint8
-        ``MATCHED``; ``DUPLICATE``: within the matching threshold of a true keypoint, but not matched; ``NEAR_MISS``:
-        beyond every matching threshold, but within one radius of a true keypoint; ``CLUTTER``: all other detections.
+        ``MATCHED``: matched to a true keypoint. ``DUPLICATE``: within the matching threshold of a true keypoint, but
+        not matched. ``NEAR_MISS``: beyond every matching threshold, but within one radius of a true keypoint.
+        ``CLUTTER``: all other detections.
 
     Examples
     --------
@@ -126,7 +127,7 @@ class _Pairs(NamedTuple):
     d: Int
     """Row of the detection."""
     distance: Float
-    """Distance between the two, px."""
+    """Distance between the keypoint and the detection, px."""
 
     def select(self, rows: Int | NDArray[np.bool_]) -> _Pairs:
         return _Pairs(self.t[rows], self.d[rows], self.distance[rows])
@@ -140,8 +141,8 @@ def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
     truth : TruthPoints
     found : DetectionPoints
     eps : float
-        Matching threshold: the largest distance of a match, in radii of the true keypoint. A distance equal to
-        ``eps * radius`` is a match.
+        Matching threshold: the largest distance of a match, in radii of the true keypoint. A pair at exactly this
+        distance can match.
 
     Returns
     -------
@@ -183,13 +184,13 @@ def _find_contested(pairs: _Pairs) -> NDArray[np.bool_]:
 def _choose_matches(
     pairs: _Pairs, contested: NDArray[np.bool_], truth: TruthPoints, found: DetectionPoints
 ) -> NDArray[np.int64]:
-    """Return the rows of the pairs that are matches."""
+    """Return the rows of ``pairs`` that become matches."""
     rows = np.flatnonzero(contested)
     return np.concatenate([np.flatnonzero(~contested), rows[_assign_contested(pairs.select(rows), truth, found)]])
 
 
 def _find_nearest(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
-    """Return the nearest true keypoint of each detection, or -1. The lowest in (x, y) wins a tie."""
+    """Return :attr:`Matches.nearest`. Of several nearest keypoints, take the one of smallest x, then smallest y."""
     shared = np.bincount(pairs.d, minlength=len(found.xy))[pairs.d] > 1
     nearest = np.full(len(found.xy), -1)
     nearest[pairs.d[~shared]] = pairs.t[~shared]
@@ -201,7 +202,7 @@ def _find_nearest(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> 
 
 
 def _find_contradicted(contested: _Pairs, detection: Int, found: DetectionPoints) -> NDArray[np.bool_]:
-    """Mark the keypoints whose match has a twin of another identity, see :attr:`Matches.contradicted`."""
+    """Return :attr:`Matches.contradicted`. A twin is a detection with the place and the score of the match."""
     contradicted = np.zeros(len(detection), bool)
     if found.patch_id is not None:
         t, d = contested.t, contested.d
@@ -215,9 +216,10 @@ def _find_contradicted(contested: _Pairs, detection: Int, found: DetectionPoints
 def _find_pairs(truth: TruthPoints, found: DetectionPoints, reach: Float) -> _Pairs:
     """Return all pairs of a keypoint and a detection in the same image that are at most ``reach`` (T,) px apart.
 
-    All images lie side by side along one axis. The coordinate of a detection is the image's number times a stride, plus
-    x. The detections are sorted by this coordinate, so two binary searches per keypoint find the detections that are
-    near in x. ``slack`` allows for rounding along the long axis; distances are computed from the original x and y.
+    All images are placed side by side along one axis. The coordinate of a detection on this axis is the image's index
+    times a stride, plus x. The detections are sorted by this coordinate. So two binary searches per keypoint find the
+    detections within ``reach`` in x. ``slack`` covers the rounding errors of the coordinate. The distances are computed
+    from the original x and y.
     """
     none = _Pairs(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0))
     if not len(truth.xy) or not len(found.xy):
@@ -247,7 +249,7 @@ def _find_pairs(truth: TruthPoints, found: DetectionPoints, reach: Float) -> _Pa
 
 
 def _first_of_each(group: Int, *keys: NDArray[Any]) -> Int:
-    """Return for each group the row that is smallest in ``keys``. The first key has priority."""
+    """Return the row of each group that has the smallest keys. The first key has priority."""
     order = np.lexsort((*reversed(keys), group))
     first: Int = order[np.append(True, np.diff(group[order]) != 0)[: len(order)]]
     return first
@@ -286,10 +288,10 @@ def _rank(*keys: Float) -> Int:
 def _assign_component(a: Int, b: Int, distance: Float, score: Float) -> Int:
     """Return the rows of the best one-to-one assignment within one connected component of pairs (a, b).
 
-    The sets of detections that can all be matched form a transversal matroid. So with any positive weights that rise
-    with the score, the heaviest assignment has the most matches and the highest scores. The weight of a pair is the
-    rank of the score, a whole number, minus a fraction that rises with the distance. The fractions of an assignment add
-    up to less than one rank.
+    The sets of detections that can be matched together form a transversal matroid. So for any positive weights that
+    rise with the score, the assignment of the largest total weight has the most matches and the highest scores. The
+    weight of a pair is the rank of the score, a whole number, minus a fraction that rises with the distance. The
+    fractions of an assignment add up to less than 1, so distances decide only between assignments of equal scores.
     """
     if not len(a):
         return np.zeros(0, np.int64)

@@ -1,4 +1,4 @@
-"""Compute the errors of a known board's pose that a detector's errors cause."""
+"""Compute the pose of a known board from a detector's matches, and the errors of this pose."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class PoseErrors:
     Attributes
     ----------
     translation_percent : ndarray of shape (N,), float64
-        Distance between the estimated and the true place of the board's origin, in % of the origin's true
-        distance from the camera.
+        Distance between the estimated and the true position of the board's origin, in % of the true distance from
+        the camera to the origin.
     rotation_deg : ndarray of shape (N,), float64
         Angle between the estimated and the true orientation, degrees.
 
@@ -45,7 +45,7 @@ class PoseErrors:
 class PoseGroup:
     """Percentiles of the pose errors over all images, or over the images of one condition and rung.
 
-    Only images with a pose count. The percentiles are None if no image has a pose.
+    Images without a pose do not influence the percentiles. The percentiles are None if no image has a pose.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ def group_pose_errors(scores: Scores, errors: PoseErrors) -> tuple[PoseGroup, ..
     Parameters
     ----------
     scores : Scores
-        The scores whose outcomes the errors were computed from.
+        The scores that hold the outcomes given to :func:`compute_pose_errors`.
     errors : PoseErrors
 
     Returns
@@ -114,17 +114,17 @@ def group_pose_errors(scores: Scores, errors: PoseErrors) -> tuple[PoseGroup, ..
 
 
 def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) -> PoseErrors:
-    """Compare two poses of the board in each image: from the matched detections, and from the true keypoints.
+    """Compare the board's pose from the matched detections with the pose from the true keypoints, in each image.
 
-    ``solvePnP`` estimates both poses. The match tells which keypoint of the board a detection is, so wrong identities
-    and false alarms have no influence. The estimated pose of a distant board may flip; a flip counts as a large
-    rotation.
+    ``solvePnP`` estimates both poses. The match assigns a detection to a keypoint of the board, so wrong identities and
+    false alarms have no influence. A distant board has two poses that fit almost equally well. If the estimate is the
+    wrong pose, the rotation error is large.
 
     Parameters
     ----------
     outcomes : Outcomes
     points_mm : ndarray of shape (K, 3), float64
-        The board's keypoints, mm in the frame of the board, z = 0, in the order of each image's true keypoints.
+        The board's keypoints in the board's frame, mm, with z = 0. Each image lists its true keypoints in this order.
     camera : Camera
 
     Returns
@@ -175,7 +175,7 @@ def compute_pose_errors(outcomes: Outcomes, points_mm: Float, camera: Camera) ->
 
 
 def _estimate_pose(points_mm: Float, xy: Float, camera: Camera) -> tuple[Float, Float]:
-    """Return the rotation (3, 3) and the translation (3,) in mm from the board's frame to the camera's.
+    """Return the rotation (3, 3) and the translation (3,), mm, from the board's frame to the camera's frame.
 
     IPPE returns the better of the two candidate poses of a plane. Levenberg-Marquardt refines this pose.
     """

@@ -27,11 +27,11 @@ from scipy.special import ndtr, ndtri, stdtrit
 from kpbench.types import Float, Int
 
 TAIL = 0.025
-"""Nominal probability that the true value lies below a 95 % interval; equally, that it lies above the interval."""
+"""Nominal probability that the true value lies below a 95 % interval. The probability above is the same."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
-"""Largest number of kinds of scenes (scenes of equal counts) to draw from. If there are more, scenes are pooled."""
+"""Largest number of kinds to draw from. Scenes of equal counts are one kind. More kinds are pooled at random."""
 
 
 def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
@@ -42,12 +42,12 @@ def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
     sums : ndarray of shape (N, M)
         Counts per image.
     scene : ndarray of shape (N,), int64
-        Number of each image's scene.
+        Scene ID of each image.
 
     Returns
     -------
     ndarray of shape (C, M)
-        Counts per scene, in the order of the scenes' numbers; in the order of the images if no two share a scene.
+        Counts per scene, in the order of the scene IDs. If no two images share a scene, in the order of the images.
     """
     order = np.argsort(scene, kind="stable")
     starts = np.flatnonzero(np.append(True, np.diff(scene[order]) != 0)[: len(order)])
@@ -59,15 +59,15 @@ def bootstrap_intervals(
 ) -> dict[str, Interval | None]:
     """Compute 95 % intervals of statistics of summed counts, by drawing scenes with replacement.
 
-    Scenes of equal counts form one kind. To draw C scenes, the function draws how many scenes of each kind there are,
-    from a multinomial distribution. So the cost depends on the number of kinds, not on the number of scenes.
+    Scenes of equal counts form one kind. A resample is one draw from a multinomial distribution, which gives the number
+    of scenes of each kind. So the cost depends on the number of kinds, not on the number of scenes.
 
     Parameters
     ----------
     sums : ndarray of shape (C, M)
         Counts per scene, whole numbers.
     statistics : function
-        Function that computes named values of shape (...) from sums of shape (..., M); nan where a value is undefined.
+        Function that computes named values of shape (...) from sums of shape (..., M). An undefined value is nan.
     resamples : int
         Number of resamples. 0 computes no intervals.
     seed : int
@@ -76,7 +76,7 @@ def bootstrap_intervals(
     Returns
     -------
     dict of str to (low, high) or None
-        None for fewer than two scenes, without resamples, and for a value that is undefined in all resamples.
+        None if there are fewer than two scenes, ``resamples`` is 0, or the value is undefined in all resamples.
 
     Examples
     --------
@@ -91,7 +91,7 @@ def bootstrap_intervals(
         return dict.fromkeys(statistics(sums.sum(axis=0)))
     kinds, count = _unique_rows(sums)
     rng = np.random.default_rng(seed)
-    if len(kinds) > MOST_KINDS:  # random pools of equal size: sums of drawn pools vary like sums of drawn scenes
+    if len(kinds) > MOST_KINDS:  # random pools of about equal size: sums of pools vary like sums of scenes
         shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
         count = np.ones(MOST_KINDS, np.int64)
@@ -110,7 +110,7 @@ def bootstrap_intervals(
 def _percentile_levels(values: Float, found: float, without_one: Float, count: Int, scenes: int) -> Float:
     """Return the two quantile levels that bound a 95 % interval.
 
-    For many scenes without bias and skewness the levels are 0.025 and 0.975.
+    Without bias and skewness, the levels approach 0.025 and 0.975 as the number of scenes grows.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
     found : float
         The statistic of all scenes.
     without_one : ndarray of shape (K,), float64
-        The statistic of all scenes but one, where the scene left out is of each kind in turn (jackknife).
+        The statistic after one scene of each kind in turn is removed (jackknife).
     count : ndarray of shape (K,), int64
         Number of scenes of each kind.
     scenes : int

@@ -30,10 +30,11 @@ class Breakpoint:
         "falls": the score falls under the limit as the rung grows. "rises": the score rises to the limit or over it.
         "over": the score is at or over the limit at all rungs. "under": the score is under the limit at all rungs.
     rung : float or None
-        The first such crossing, interpolated linearly between rungs; None for "over" and "under".
+        Rung of the first crossing of this kind, interpolated linearly; None for "over" and "under".
     interval : (low, high) or None
-        95 % interval of the rung from resampled scenes. A resample without such a crossing counts as the first or the
-        last rung. None for fewer than two scenes, without resamples, and for "over" and "under".
+        95 % interval of the rung from resampled scenes. A resample that does not cross the limit in this direction
+        counts as a crossing at the first or the last rung. None for "over" and "under", for fewer than two scenes, and
+        if `resamples` is 0.
 
     Examples
     --------
@@ -56,18 +57,19 @@ class Breakpoint:
 def find_breakpoints(scores: Scores, limit: float = DETECTION_SCORE_LIMIT) -> tuple[Breakpoint, ...]:
     """Find the first falling and the first rising crossing of each condition.
 
-    The detection score comes from one-to-one matching, even if the settings say "literal".
+    The detection score comes from one-to-one matching, even if `matching` in the settings is "literal".
 
     Parameters
     ----------
     scores : Scores
     limit : float
-        Detection score to be crossed.
+        The detection score that separates "over" from "under".
 
     Returns
     -------
     tuple of Breakpoint
-        For each condition, at most one that "falls" and at most one that "rises", or one that is "over" or "under".
+        For each condition, at most one breakpoint "falls" and at most one "rises". A condition without crossings has
+        one breakpoint "over" or "under", if the detection score is defined at all rungs.
 
     Examples
     --------
@@ -103,7 +105,10 @@ def _find_in_condition(scores: Scores, name: str, rungs: list[float], limit: flo
 
 
 def _sums_by_rung(scores: Scores, condition: str, rungs: list[float]) -> Int:
-    """Return (C, 2R) counts per scene of a condition: true keypoints and matches at the first rung, the second, …"""
+    """Return the counts of each scene of a condition, of shape (C, 2R).
+
+    The first two columns count the true keypoints and the matches at the first rung. Further rungs follow, in order.
+    """
     truth, sums = scores.outcomes.truth, scores.outcomes.image_sums
     images = np.flatnonzero(truth.condition == condition)
     position = np.searchsorted(rungs, truth.rung[images])
@@ -123,8 +128,8 @@ def _detection_scores(sums: NDArray[Any], rungs: int) -> Float:
 def _first_crossing(levels: Float, value: Float, limit: float, rising: bool) -> Float:
     """Return the level at which values of shape (..., R) first fall under a limit; nan without a crossing.
 
-    If ``rising``, return the level at which the values first rise to the limit. The values at ``levels`` (R,) are
-    interpolated linearly.
+    If ``rising``, return the level at which the values first rise to the limit or over it. The values are interpolated
+    linearly between the ``levels`` (R,).
     """
     if len(levels) < 2:
         return np.full(value.shape[:-1], np.nan)

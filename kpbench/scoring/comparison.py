@@ -23,7 +23,7 @@ LOWER_IS_BETTER = ("average_false_alarm",)
 
 @dataclass(frozen=True)
 class Difference:
-    """The first detector's metric minus the second's, over all images or those of one condition and rung.
+    """The difference of a metric between two detectors, over all images or over one condition and rung.
 
     Attributes
     ----------
@@ -34,10 +34,10 @@ class Difference:
     metric : str
         One of :data:`COMPARED_METRICS`.
     first, second : float or None
-        The metric of each detector; None where undefined.
+        The metric of each detector; None if the metric is undefined.
     interval : (low, high) or None
-        95 % interval of the difference. Each resample draws the same scenes for both detectors. None for fewer than
-        two scenes, without resamples, or if a metric is undefined.
+        95 % interval of ``first`` minus ``second``. Each resample draws the same scenes for both detectors. None for
+        fewer than two scenes, if `resamples` is 0, or if a metric is undefined.
 
     Examples
     --------
@@ -56,12 +56,12 @@ class Difference:
 
     @property
     def value(self) -> float | None:
-        """First minus second; None if one of the two metrics is undefined."""
+        """``first`` minus ``second``; None if ``first`` or ``second`` is None."""
         return None if self.first is None or self.second is None else self.first - self.second
 
     @property
     def verdict(self) -> str:
-        """Verdict on the first detector: "better", "worse", or "even" if the interval contains 0 or is None."""
+        """Verdict on the first detector: "better", "worse" or "even" (the interval contains 0 or is None)."""
         if self.value is None or self.interval is None or self.interval[0] <= 0 <= self.interval[1]:
             return "even"
         return "better" if (self.value > 0) != (self.metric in LOWER_IS_BETTER) else "worse"
@@ -73,7 +73,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Comparison:
-    """The differences of two detectors.
+    """The differences between the metrics of two detectors.
 
     Attributes
     ----------
@@ -95,7 +95,7 @@ class Comparison:
     differences: tuple[Difference, ...]
 
     def verdicts(self, metric: str) -> dict[str, int]:
-        """Count the verdicts on the first detector: one per rung, or one over all images if there are no rungs."""
+        """Count the verdicts on the first detector in each rung, or over all images if the images have no rungs."""
         overall, *of_rungs = (d.verdict for d in self.differences if d.metric == metric)
         found = of_rungs or [overall]
         return {verdict: found.count(verdict) for verdict in ("better", "even", "worse")}
@@ -108,8 +108,8 @@ class Comparison:
 def compare(first: Scores, second: Scores) -> Comparison:
     """Compute paired differences of the paper's metrics, precision and F1.
 
-    Each resample draws the same scenes for both detectors. A scene that is hard for both then does not widen the
-    interval of the difference.
+    Each resample draws the same scenes for both detectors. So a scene that is hard for both detectors does not widen
+    the interval of the difference.
 
     Parameters
     ----------
@@ -168,13 +168,13 @@ def _compute_differences(first: Scores, second: Scores) -> Iterator[Difference]:
 
 
 def check_regression(comparisons: Sequence[Comparison]) -> None:
-    """Refuse a first detector that is worse than another in one of the paper's three metrics over all images.
+    """Raise an error if the first detector is worse than another detector in a metric of the paper, over all images.
 
     Raises
     ------
     GateFailed
-        If a metric is worse, or if a metric differs and the difference has no interval, as with a single scene. The
-        message names every such metric.
+        If a metric is worse, or if a metric differs and the difference has no interval. A single scene gives no
+        interval. The message names every such metric.
 
     Examples
     --------
@@ -190,7 +190,7 @@ def check_regression(comparisons: Sequence[Comparison]) -> None:
             if d.value and d.interval is None:
                 failed.append(
                     f"{LABELS[d.metric]} of {c.first} differs from that of {c.second} by {d.value:+.4f}, "
-                    "and one scene cannot tell whether by chance"
+                    "and without an interval the difference may be chance"
                 )
             if d.verdict == "worse" and d.interval:
                 failed.append(

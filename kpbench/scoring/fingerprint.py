@@ -11,14 +11,14 @@ from kpbench.types import Int, Predictions, Truth
 
 
 def find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> Int:
-    """Return for each detection the position of its image in the truth, of shape (D,).
+    """Return the index in the truth of each detection's image, of shape (D,).
 
     Raises
     ------
     PredictionsError
-        If the fingerprints differ, or if an image is unknown or missing.
+        If the fingerprints differ, an image is unknown, or an image is missing and ``allow_missing`` is False.
     DataError
-        If the dataset has an image_id twice.
+        If two images of the dataset share an image_id.
     """
     named = predictions.fingerprint or predictions.dataset or ""
     if re.fullmatch("[0-9a-f]{64}", named) and truth.fingerprint and named != truth.fingerprint:
@@ -34,7 +34,7 @@ def find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> 
     if unknown.any():
         raise PredictionsError(
             f"image_id {predictions.image_id[unknown].min()} is not in the dataset ({len(ids)} images, image_id "
-            f"{ids[0]} to {ids[-1]}); {np.count_nonzero(unknown)} predictions are of images that it does not have"
+            f"{ids[0]} to {ids[-1]}); {np.count_nonzero(unknown)} predictions are of unknown images"
         )
     missing = np.ones(len(ids), bool)
     missing[place] = False

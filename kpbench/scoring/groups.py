@@ -29,7 +29,7 @@ _NEED_DETECTIONS = {
     *("average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"),
     *("detections", "duplicate", "near_miss", "clutter"),
 }
-"""Metrics and counts that are undefined where detections cannot be divided among the groups."""
+"""Metrics and counts that are undefined if the false alarms of an image belong to no single group."""
 _NEED_IDS = {"id_matching_score", "id_matching_score_literal", "id_correct", "wrong_id", "id_correct_literal"}
 """Metrics and counts that are undefined for a detector without identities."""
 
@@ -40,13 +40,13 @@ class GroupKey(NamedTuple):
     Attributes
     ----------
     condition : str or None
-        Name of the experiment.
+        Name of the condition.
     rung : float or None
         Severity within the condition.
     patch_id : int or None
-        Identity of the true keypoints.
+        Patch ID of the true keypoints.
     radius_px : (low, high) or None
-        Radii of the true keypoints, low < radius <= high; no upper limit if ``high`` is None.
+        Radii of the true keypoints, low < radius <= high. If ``high`` is None, the radii have no upper limit.
 
     Examples
     --------
@@ -63,12 +63,12 @@ class GroupKey(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """The metrics of some of the images, or of some keypoints in them.
+    """The metrics over some of the images or over some of the keypoints.
 
     Attributes
     ----------
     key : GroupKey
-        The condition, rung and patch ID are also properties of the group.
+        The condition, rung, patch and radii of the group.
     metrics : dict of str to float or None
         The value of each of :data:`kpbench.scoring.METRICS`; None if the metric is undefined for the group.
     counts : dict of str to int or None
@@ -91,7 +91,7 @@ class Group:
 
     @property
     def condition(self) -> str | None:
-        """Name of the experiment."""
+        """Name of the condition."""
         return self.key.condition
 
     @property
@@ -101,11 +101,11 @@ class Group:
 
     @property
     def patch_id(self) -> int | None:
-        """Identity of the true keypoints."""
+        """Patch ID of the true keypoints."""
         return self.key.patch_id
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the group's ``metrics`` object of the scores file."""
+        """Return the ``metrics`` object of this group in the scores file."""
         return {**self.metrics, "counts": self.counts, "intervals": self.intervals}
 
 
@@ -122,10 +122,10 @@ class _Units(NamedTuple):
     of_detection: Int
     """Unit of each detection, of shape (D,); -1 for a detection that belongs to no unit."""
     shared: NDArray[np.bool_]
-    """Whether the unit's image has several units, of shape (M,). The image's false alarms then belong to no unit."""
+    """Whether the unit's image has several units, of shape (M,). The image's detections then belong to no unit."""
 
     def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
-        """Compute a group for each key; ``label`` (M,) is each unit's position in ``keys``."""
+        """Compute a group for each key. ``label`` (M,) holds the index in ``keys`` of each unit."""
         label_or_none = np.append(label, -1)  # the unit -1 indexes the appended label -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
         labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
@@ -172,9 +172,9 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     Yields
     ------
     Group
-        First all images. Then each condition and rung; each patch within each condition and rung; each patch over all
-        images; and each bin of radii over all images. A single patch or bin has no group, and neither have images
-        without condition and rung.
+        First a group of all images. Then a group for each condition and rung; for each patch within each condition and
+        rung; for each patch over all images; and for each bin of radii over all images. Groups for patches need several
+        patches. Groups for bins need several bins. Images without condition and rung form no group of their own.
     """
     truth, n = outcomes.truth, len(outcomes.truth)
     image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image
@@ -212,9 +212,10 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
 
 
 def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, Int, _Units]:
-    """Divide each image into units of keypoints of one label.
+    """Divide each image into units. A unit holds the keypoints of one label.
 
-    A false alarm has no label. If the image has a single unit, the false alarm belongs to this unit, else to no unit.
+    If an image has a single unit, the detections in the image belong to this unit. Otherwise the detections belong to
+    no unit, because a false alarm has no label.
 
     Parameters
     ----------

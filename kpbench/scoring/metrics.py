@@ -65,7 +65,7 @@ COUNTS = (
     "matched_literal",
     "id_correct_literal",
 )
-"""Names of all counts. A truth is matched or missed. A detection is matched, duplicate, near_miss or clutter."""
+"""Names of all counts. ``truths`` is matched plus missed. All kinds of detections add up to ``detections``."""
 
 LABELS = {
     "detection_score": "detection score",
@@ -149,7 +149,7 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
     threshold : ndarray of shape (K,), float64
         The distinct scores, in falling order.
     matches, detections : ndarray of shape (K,), float64
-        Number of matches, and number of detections, at each threshold.
+        Number of matches, and number of detections, at or above each threshold.
     """
     every, hits = np.sort(score), np.sort(score[hit])  # sorting values is several times faster than sorting indices
     first = np.flatnonzero(np.append(True, np.diff(every) != 0)[: len(every)])[::-1]
@@ -162,14 +162,14 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
 def compute_average_precision(score: Float, hit: NDArray[np.bool_], truths: int) -> float | None:
     """Compute the area under the precision-recall curve, without interpolation.
 
-    The area is the sum of (recallₖ − recallₖ₋₁) · precisionₖ over all thresholds k, from the highest down.
+    The area is the sum of (recallₖ − recallₖ₋₁) · precisionₖ over all thresholds k, in falling order.
 
     Parameters
     ----------
     score, hit : ndarray of shape (D,)
         As for :func:`count_above_thresholds`.
     truths : int
-        Number of true keypoints. If it is 0, the result is None.
+        Number of true keypoints. The result is None if ``truths`` is 0.
     """
     _, matches, detections = count_above_thresholds(score, hit)
     return float(np.sum(np.diff(matches, prepend=0.0) / truths * matches / detections)) if truths else None
@@ -187,7 +187,7 @@ def compute_error_metrics(distance: Float, radius: Float) -> dict[str, float | N
     """
     metrics: dict[str, float | None] = {}
     for unit, error in (("px", distance), ("radii", distance / radius)):
-        error = np.sort(error)  # the order of images must not change the last bit of the RMS
+        error = np.sort(error)  # so that the order of images does not change the last bit of the RMS
         some = len(error) > 0
         median, p95 = np.percentile(error, [50, 95]).tolist() if some else (None, None)
         metrics[f"error_median_{unit}"], metrics[f"error_p95_{unit}"] = median, p95

@@ -1,4 +1,4 @@
-"""Check predictions against the truth and match them. The resulting rows are the input of all metrics and reports."""
+"""Check predictions and match them to the truth. All metrics and reports are computed from the outcomes."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Settings:
     eps_radius : {"major", "minor", "mean"}
         The radius of a projected circle: its major semi-axis, its minor semi-axis, or the mean of both.
     matching : {"one-to-one", "literal"}
-        "literal" takes the paper's formulas as they are printed. Every detection within ``eps`` then counts, so a
-        detection score can exceed 1.
+        "literal" takes the paper's formulas as they are printed. Every detection within the matching threshold then
+        counts as a match, so a detection score can exceed 1.
     resamples : int
         Number of bootstrap resamples for the intervals. 0 computes no intervals.
     seed : int
@@ -66,26 +66,27 @@ class Settings:
 class Outcomes:
     """The outcome of each of T true keypoints and D detections in N images.
 
-    Rows keep the order of the truth and of the predictions, so that the rows of an image are contiguous in memory. With
-    millions of images, any other order is slow.
+    Rows keep the order of the truth and of the predictions. The rows of an image are then contiguous in memory, which
+    millions of images need for speed.
 
     Attributes
     ----------
     truth : Truth
     truth_points : TruthPoints
-        Place, radius and image of each true keypoint. The image is a position in ``truth``.
+        Place, radius and image of each true keypoint. The image is an index into ``truth``.
     truth_id : ndarray of shape (T,), int64
         True identity.
     detections : DetectionPoints
-        Place, score, image and identity of each detection. The image is a position in ``truth``.
+        Place, score, image and identity of each detection. The image is an index into ``truth``.
     matches : Matches
     correct : ndarray of shape (T,), bool
-        Whether the true keypoint is matched by a detection of the right identity.
+        Whether the true keypoint is matched by a detection of the right identity, and the identity is not contradicted
+        (see :class:`kpbench.scoring.Matches`).
     literally_correct : ndarray of shape (D,), bool
         Whether the detection has the identity of the nearest true keypoint within the matching threshold.
     settings : Settings
     detector : dict
-        The detector as the predictions describe it.
+        The description of the detector in the predictions.
 
     Examples
     --------
@@ -118,14 +119,14 @@ class Outcomes:
         return self.sum_rows(self.truth_points.image, self.detections.image, len(self.truth))
 
     def sum_rows(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
-        """Count true keypoints, detections and their outcomes by rows that the caller defines, such as images.
+        """Count true keypoints, detections and their outcomes per row. The caller defines the rows, such as images.
 
         Parameters
         ----------
         row_of_truth : ndarray of shape (T,), int64
-            The row that each true keypoint belongs to.
+            Row of each true keypoint.
         row_of_detection : ndarray of shape (D,), int64
-            The row that each detection belongs to. Detections of row -1 are left out.
+            Row of each detection. Detections of row -1 are left out.
         rows : int
             Number of rows.
 
@@ -156,7 +157,7 @@ class Outcomes:
 def match_predictions(
     truth: Truth, predictions: Predictions, settings: Settings | None = None, *, allow_missing: bool = False
 ) -> Outcomes:
-    """Check that the predictions are of the images of the truth, and match them.
+    """Check that the predictions fit the images of the truth, and match the detections.
 
     Parameters
     ----------
@@ -164,7 +165,8 @@ def match_predictions(
     predictions : Predictions
     settings : Settings, optional
     allow_missing : bool
-        Whether an image without prediction counts as an image without detections, instead of being refused.
+        Whether to accept an image that the predictions lack, as an image without detections. If False, such an image
+        is an error.
 
     Returns
     -------
@@ -173,7 +175,7 @@ def match_predictions(
     Raises
     ------
     PredictionsError
-        If the predictions are of other images, or have another dataset's fingerprint.
+        If the predictions name unknown images, lack images, or name the fingerprint of another dataset.
     DataError
         If there are no images, two images share an image_id, a place is not finite, or a radius is not a positive
         number.
@@ -192,7 +194,7 @@ def match_predictions(
     image = find_images(truth, predictions, allow_missing)
     points = _read_points(truth, settings.eps_radius)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
-    # Predictions without detections show no lack of IDs, so the metrics of identities stay defined
+    # Without detections, missing IDs do not prove a detector without identities: keep the ID metrics defined
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
     detections = DetectionPoints(predictions.xy, predictions.score, image, ids)
     matches = match(points, detections, settings.eps)
@@ -207,7 +209,7 @@ def match_predictions(
 
 
 def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
-    """Return the true keypoints as columns, after checking them."""
+    """Check the true keypoints, and return them as columns."""
     keypoints = truth.keypoints
     xy = np.stack([keypoints["x"], keypoints["y"]], axis=1).astype(np.float64)
     major, minor = keypoints["radius_major"].astype(np.float64), keypoints["radius_minor"].astype(np.float64)

@@ -3,14 +3,14 @@
 Conventions
 -----------
 A detection can match a true keypoint if their distance is **at most** the matching threshold: ε times the radius of
-*that* keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection is matched to one keypoint. Of all
-one-to-one assignments kpbench takes the best: the most matches, then the highest scores, then the smallest distances,
-then the lowest place in (x, y). Identities do not influence the matches, and neither does the order of images,
-keypoints and detections.
+*that* keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection is matched to one keypoint. The
+best one-to-one assignment has the most matches, then the highest scores, then the smallest sum of distances. If several
+assignments are equally good, x decides, then y. Identities do not influence the matches. The order of images, keypoints
+and detections does not influence the matches.
 
-The steps are the modules ``assignment`` (matches), ``outcomes`` (rows), ``metrics`` and ``bootstrap`` (numbers from
-sums), ``groups`` (of images and keypoints), and this module. ``docs/reference/metrics.md`` describes each metric with
-its edge cases.
+Each step has a module. ``assignment`` finds the matches, and ``outcomes`` judges each keypoint and detection.
+``metrics`` and ``bootstrap`` compute metrics and intervals, and ``groups`` does so for groups of images and keypoints.
+This module puts the scores together. ``docs/reference/metrics.md`` describes each metric with its edge cases.
 """
 
 from __future__ import annotations
@@ -49,14 +49,15 @@ class Scores:
         The metrics of each condition and rung. If the truth has several patches, also the metrics of each patch, within
         each condition and rung and over all images. If radii fall into several bins, also the metrics of each bin.
     confusion : dict
-        The identities of matched detections. ``ids`` holds the true IDs, sorted. ``matrix`` has a row per true ID and
-        a column per detected ID. The last column counts IDs that no true keypoint has, and contradicted IDs (see
-        :class:`kpbench.scoring.Matches`). The dict is empty for a detector without identities.
+        The identities of matched detections. ``ids`` holds the true IDs, sorted. ``matrix`` counts matches. Each row
+        is a true ID, and each column but the last is a detected ID, both in the order of ``ids``. The last column
+        counts detected IDs that no true keypoint has, and contradicted IDs (see :class:`kpbench.scoring.Matches`). The
+        dict is empty for a detector without identities.
     curve : dict
         ``score`` holds score thresholds in falling order. ``precision``, ``recall`` and ``average_false_alarm`` are the
-        metrics of the detections at or above each threshold. At most 201 points.
+        metrics of the detections at or above each threshold. The curve has at most 201 points.
     outcomes : Outcomes
-        The rows behind the numbers: every true keypoint and every detection.
+        The outcome of every true keypoint and every detection.
     name : str
         Name and version of the detector, for tables and charts.
 
@@ -86,12 +87,12 @@ class Scores:
 
     @property
     def detector(self) -> dict[str, Any]:
-        """The detector as the predictions describe it."""
+        """The description of the detector in the predictions."""
         return self.outcomes.detector
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the dataset, "" if unknown."""
+        """Fingerprint of the dataset; "" if unknown."""
         return self.outcomes.truth.fingerprint
 
     def group(self, condition: str | None, rung: float | None, patch_id: int | None = None) -> Group | None:
@@ -100,7 +101,7 @@ class Scores:
 
     @property
     def conditions(self) -> dict[str, list[float]]:
-        """Rising rungs of each condition that has rungs; conditions in the order of their first image."""
+        """The rungs of each condition that has rungs, sorted. Conditions are in the order of their first images."""
         names = dict.fromkeys(self.outcomes.truth.condition.tolist())
         rungs: dict[str, list[float]] = {name: [] for name in names if name}
         for g in self.by:
@@ -123,7 +124,7 @@ class Scores:
     def rows(self) -> list[dict[str, Any]]:
         """Return a flat table: a row over all images, then a row per group.
 
-        The names of interval bounds end in ``_low`` and ``_high``.
+        The columns of interval bounds end in ``_low`` and ``_high``.
         """
         return [
             {"condition": g.condition, "rung": g.rung, "patch_id": g.patch_id}
@@ -209,11 +210,12 @@ def score(
     ----------
     truth : Truth or Dataset
     detections : Predictions or iterable of Detections
-        Predictions by image ID; or one :class:`kpbench.Detections` per image of the truth, in the truth's order.
+        Predictions, or one :class:`kpbench.Detections` per image of the truth, in the truth's order.
     eps, eps_radius, matching, resamples, seed
         As in :class:`kpbench.scoring.Settings`.
     allow_missing : bool
-        Whether an image without prediction counts as an image without detections, instead of being refused.
+        Whether to accept an image that the predictions lack, as an image without detections. If False, such an image
+        is an error.
 
     Returns
     -------
@@ -222,7 +224,7 @@ def score(
     Raises
     ------
     PredictionsError
-        If the predictions are of other images than the truth, or have another dataset's fingerprint.
+        If the predictions name unknown images, lack images, or name the fingerprint of another dataset.
     DataError
         If the truth has no images, two of its images share an image_id, a place is not finite, or a radius is not a
         positive number.
@@ -256,8 +258,8 @@ def score(
     ...         "average_false_alarm": (detections - matched) / len(images),
     ...     }
 
-    In the paper's own formulas (`matching` "literal"), several detections of one keypoint all count. These formulas
-    give a detection score that is at least as high, and an average false alarm that is at most as high.
+    In the paper's own formulas (`matching` "literal"), all detections of one keypoint count as matches. So the
+    detection score is never lower than with one-to-one matching, and the average false alarm is never higher.
 
     Examples
     --------
@@ -272,9 +274,7 @@ def score(
     if not isinstance(detections, Predictions):
         listed = list(detections)
         if len(listed) != len(table):
-            raise PredictionsError(
-                f"{len(listed)} images with detections, expected one for each of {len(table)} images"
-            )
+            raise PredictionsError(f"detections of {len(listed)} images, expected detections of {len(table)} images")
         detections = Predictions.from_detections(listed, table.image_id)
     return compute_scores(match_predictions(table, detections, settings, allow_missing=allow_missing))
 
@@ -297,18 +297,19 @@ def compute_scores(outcomes: Outcomes) -> Scores:
 
 
 def check_gates(scores: Scores, least: dict[str, float], most: dict[str, float]) -> None:
-    """Refuse scores that miss a limit. An undefined metric misses every limit.
+    """Raise an error if a metric misses its limit. An undefined metric misses every limit.
 
     Parameters
     ----------
     scores : Scores
     least, most : dict of str to float
-        Limits of metrics over all images, by name. A metric equal to its limit meets it.
+        Smallest and largest accepted value of metrics over all images, by name of the metric.
 
     Raises
     ------
     GateFailed
-        If a metric is below ``least`` or above ``most``; the message names every such metric.
+        If a metric is undefined, below its value in ``least`` or above its value in ``most``. The message names every
+        such metric.
 
     Examples
     --------

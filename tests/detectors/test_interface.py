@@ -99,7 +99,7 @@ def test_to_grey_refuses_what_is_no_image():
 
 
 def test_detections_must_fit_together():
-    with pytest.raises(ValueError, match="expected as many"):
+    with pytest.raises(ValueError, match="expected one per point"):
         Detections([[1, 2]], [0.5, 0.6])
 
 

@@ -630,7 +630,7 @@ def test_predictions_must_be_for_the_images():
     allowed = score(truth, part, allow_missing=True)
     assert allowed["detection_score"] == pytest.approx(1 / 3)
     assert allowed.overall.counts["images"] == 3
-    with pytest.raises(PredictionsError, match="2 images with detections, expected one for each of 3"):
+    with pytest.raises(PredictionsError, match="detections of 2 images, expected detections of 3 images"):
         score(truth, [found()] * 2)
 
 
