@@ -1,8 +1,8 @@
 """Read and write predictions files: the detections of a detector in every image of a dataset.
 
 In memory the predictions are columns (:class:`kpbench.Predictions`), so that a million images need only a few arrays. A
-file is ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``. All formats hold the
-same content. ``docs/reference/predictions-format.md`` describes each format.
+file is ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``. All formats hold
+the same content. ``docs/reference/predictions-format.md`` describes each format.
 """
 
 from __future__ import annotations

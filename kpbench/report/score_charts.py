@@ -131,7 +131,7 @@ def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
 
 
 def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:
-    """Draw the outcomes of true keypoints, and in a second chart the outcomes of detections. A bar is a detector."""
+    """Draw one chart of the outcomes of true keypoints and one of detections. Each bar is a detector."""
     keypoints: tuple[str, ...] = ("found with the right ID", "found with a wrong ID", "missed")
     if any(run.overall.counts["id_correct"] is None for run in runs):
         keypoints = ("found", "missed")

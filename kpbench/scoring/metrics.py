@@ -65,7 +65,10 @@ COUNTS = (
     "matched_literal",
     "id_correct_literal",
 )
-"""Names of all counts. ``truths`` is matched plus missed. All kinds of detections add up to ``detections``."""
+"""Names of all counts.
+
+A true keypoint is matched or missed. A detection is matched, a duplicate, a near miss or clutter.
+"""
 
 LABELS = {
     "detection_score": "detection score",
