@@ -1,4 +1,4 @@
-"""Write and remove files. All modules of kpbench write and remove files through this module, by these rules:
+"""Write and remove files, by these rules:
 
 1. A file appears whole or not at all.
 2. A file that exists is replaced only if it is empty, or if kpbench wrote it as a file of the same kind. A mark in each
