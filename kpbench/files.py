@@ -23,8 +23,7 @@ _IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": 
 def shipped_folder(name: str) -> Path:
     """Return the folder of data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
 
-    A checkout holds the data in the folders where people edit the data. An installed package holds all data in one
-    folder.
+    A checkout holds the data in the folders where people edit them. An installed package holds all data in one folder.
     """
     installed = PACKAGE / "shipped" / name
     return installed if installed.is_dir() else PACKAGE.parent / _IN_CHECKOUT[name]
@@ -33,8 +32,8 @@ def shipped_folder(name: str) -> Path:
 def image_files(folder: Path, exclude: Path | None = None) -> tuple[str, ...]:
     """Return the paths of all images below a folder, relative to the folder.
 
-    The paths are sorted. Every machine therefore gives the same order. ``exclude`` : folder of results; images below
-    this folder are left out.
+    The paths are sorted. Every machine therefore gives the same order. Images below the folder ``exclude``, a folder of
+    results, are left out.
     """
     files = [f for f in folder.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES and f.is_file()]
     if exclude is not None:
@@ -48,7 +47,7 @@ _read: ContextVar[set[tuple[int, int]] | None] = ContextVar("read", default=None
 
 @contextmanager
 def protect_read_files() -> Iterator[None]:
-    """Let :func:`kpbench.writing.write_file` refuse, within a ``with`` block, the files that the block reads."""
+    """Make :func:`kpbench.writing.write_file` refuse to replace a file that the same ``with`` block has read."""
     token = _read.set(set())
     try:
         yield
@@ -57,7 +56,7 @@ def protect_read_files() -> Iterator[None]:
 
 
 def note_read(path: str | Path) -> None:
-    """Note that the running command reads a file. Every function that opens a file of the user calls this."""
+    """Note that the running command reads a file. Every function that reads a user's file calls ``note_read``."""
     noted = _read.get()
     if noted is not None:
         with suppress(OSError, ValueError):
@@ -159,7 +158,7 @@ def require_own_folder(folder: Path, mark: str, purpose: str) -> None:
     Raises
     ------
     DataError
-        The message names one of the other files, or says that the folder is a file.
+        The message names a file in the folder, or says that the path is a file.
     """
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder}: a file, expected a folder")

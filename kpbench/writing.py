@@ -1,10 +1,10 @@
-"""The one gate that files are written and removed through.
+"""Write and remove files, by these rules:
 
 1. A file appears whole or not at all.
-2. A file that exists is replaced only if kpbench wrote it, and only by a file of the same kind. A mark in each file
-   names the kind: a text such as ``kpbench.predictions/1``.
+2. A file that exists is replaced only if it is empty, or if kpbench wrote it as a file of the same kind. A mark in each
+   file names the kind: a text such as ``kpbench.predictions/1``.
 3. A command never writes to a file that it reads.
-4. A symbolic link is followed. A device, a pipe or a socket is written through, and stays what it is.
+4. A symbolic link is followed. Data for a device or a pipe go into the device or pipe, which is not replaced.
 5. A new file gets its mode from the umask. A replaced file keeps its mode.
 """
 
@@ -28,7 +28,7 @@ MARK = re.compile(rb"kpbench\.([a-z-]+)/\d")
 USER_KINDS = ("board-design", "patch", "suite")
 """Kinds of files that users write and kpbench only reads."""
 HEAD_BYTES, TAIL_BYTES = 65536, 16384
-"""A mark stands within so many bytes from the start of a file, or within so many bytes from its end."""
+"""A mark lies in the first ``HEAD_BYTES`` bytes or in the last ``TAIL_BYTES`` bytes of a file."""
 
 
 def kind_of(head: bytes, tail: bytes = b"") -> str | None:
@@ -43,14 +43,15 @@ def kind_of(head: bytes, tail: bytes = b"") -> str | None:
 def write_file(path: Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all.
 
-    On this machine: write a temporary file in the same folder, fsync the file, rename it, fsync the folder. At a URL:
-    put the file in one piece. Object stores write one piece whole or not at all.
+    On this machine, the data go into a temporary file in the same folder. The temporary file is synced to the disk and
+    renamed, and the folder is synced. At a URL, the data are sent in one piece. Object stores write a piece whole or
+    not at all.
 
     Raises
     ------
     DataError
-        If the file exists and kpbench did not write it, or wrote it as a file of another kind; if the running command
-        reads the file; if the disk is full or the folder cannot be written. No other file is left behind.
+        If the file exists and kpbench did not write it, or wrote it as a file of another kind. If the running command
+        reads the file. If the disk is full or the folder cannot be written. No temporary file is left behind.
     """
     if not is_local(path):
         with _remote_errors(path):
@@ -80,9 +81,9 @@ def write_file(path: Path, data: bytes | memoryview) -> None:
 
 
 def move_file(part: Path, path: Path) -> None:
-    """Put a finished file in the place of another, under the rules of :func:`write_file`.
+    """Move a finished file to a path, under the rules of :func:`write_file`.
 
-    ``part`` lies in the folder of ``path``, and is gone afterwards.
+    ``part`` lies in the folder of ``path``. If ``path`` is a device or a pipe, the data are copied and ``part`` stays.
 
     Raises
     ------
@@ -103,12 +104,12 @@ def move_file(part: Path, path: Path) -> None:
 
 
 def is_replaceable(path: Path, kind: str) -> bool:
-    """Return whether a file of this kind may be written to a path: no file is there, or one of the same kind."""
+    """Return whether a path has no file, or a file of this kind. A path at a URL is not checked and gives True."""
     return not is_local(path) or not path.exists() or kind_of(*_ends(path)) == kind
 
 
 def require_writable(path: Path, kind: str) -> None:
-    """Refuse, before any work is done, a path that :func:`write_file` will refuse after the work.
+    """Refuse, before any work is done, a path that :func:`write_file` would refuse after the work.
 
     Raises
     ------
@@ -130,7 +131,7 @@ def require_writable(path: Path, kind: str) -> None:
 
 
 def remove_file(path: Path, kind: str) -> None:
-    """Remove a file that kpbench wrote as a file of this kind. A file that does not exist is no error.
+    """Remove a file that kpbench wrote as a file of this kind. Ignore a missing file.
 
     Raises
     ------
@@ -146,14 +147,14 @@ def remove_file(path: Path, kind: str) -> None:
 
 
 def remove_leftovers(path: Path) -> None:
-    """Remove what a killed run left of a file: its unfinished parts."""
+    """Remove the temporary files that a killed run left beside a path."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         with suppress(OSError):
             part.unlink()
 
 
 def _find_target(path: Path) -> tuple[Path, int | None]:
-    """Follow symbolic links; return the file that will be written, and its mode, None if it does not exist."""
+    """Follow symbolic links. Return the file that will be written, and its mode. The mode of a missing file is None."""
     target = Path(os.path.realpath(path))
     try:
         mode = target.stat().st_mode

@@ -209,7 +209,7 @@ def test_a_program_that_does_not_do_its_work_is_one_line(here, code, says):
 
 def test_two_suites_of_one_name_are_refused(here):
     refused = kpbench("bench", "--suite", "paper-v1", "--suite", "paper-v1", "--quick", code=2)
-    assert "suites of one name, paper-v1, paper-v1" in refused.output
+    assert "two suites have the same name: paper-v1, paper-v1" in refused.output
 
 
 def test_a_folder_of_other_files_is_left_alone(here):

@@ -57,7 +57,7 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
-        from kpbench.files import protect_read_files  # here, as it would slow down `kpbench --help`
+        from kpbench.files import protect_read_files  # imported here to keep `kpbench --help` fast
 
         try:
             with protect_read_files(), warnings.catch_warnings():
@@ -67,10 +67,10 @@ class LazyGroup(click.Group):
         except KpbenchError as error:
             click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
-        except OSError as error:  # of standard output, as a rule: an unwritable file is a KpbenchError
+        except OSError as error:  # usually of standard output: an unwritable file raises KpbenchError
             if not isinstance(error, BrokenPipeError):  # the reader closed the pipe: no message needed
                 click.echo(f"kpbench: {error.strerror or error}", err=True)
-            # without a new stdout, Python writes to the broken one at exit, and exits with 120
+            # without a replacement, Python would write to the broken stdout at exit, and exit with code 120
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)

@@ -41,7 +41,7 @@ def analyze_patches(
     figure_file: Path | None,
     backgrounds: Path | None,
 ) -> None:
-    """Measure how well designs can be located, told apart, and told from natural images.
+    """Measure how well designs can be located, and told apart from each other and from natural images.
 
     FILES are designs (TOML). Default: the shipped four.
 
@@ -74,7 +74,7 @@ def analyze_patches(
 
 
 def _tables(analysis: Analysis) -> list[Table]:
-    """Return three tables with a row per design: bounds, other measures, and distances between designs."""
+    """Return tables with a row per design: bounds, other measures, and for several designs their distances."""
     from kpbench.report.tables import Table
 
     names = [f"{design.patch_id} {design.name}" for design in analysis.designs]
@@ -100,7 +100,7 @@ def _tables(analysis: Analysis) -> list[Table]:
                 f"{distance:.3f}",
             )
         )
-    title = "Bound of the centre in px, worst direction (noise 10, contrast 180 grey levels); frontal, then 60° tilt"
+    title = "Bound of the centre's error in px, worst direction (noise 10, contrast 180 grey levels); frontal, 60° tilt"
     tables = [Table(title, ("", *sizes, *sizes, "5 px, no rim"), tuple(bounds))]
     title = "Centre, orientation, smallest size, and look-alikes (share of places in images, correlation > 0.8)"
     columns = ("crossing", "tilt bias px", "basin", "turns alike", "mirror", "needs px", "in images", "blurred")

@@ -34,7 +34,7 @@ from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, WORKERS
 @click.option(
     "--images",
     type=int,
-    help="Number of base scenes. Each is rendered with every board under every rung. Default: 500.",
+    help="Number of base scenes. Each scene is rendered with every board under every rung. Default: 500.",
 )
 @click.option(
     "--size", type=SIZE, help="Width and height in px of a camera with the same field of view. Default: 1624x1240."
@@ -58,7 +58,7 @@ def bench(
     """Make the suites, run the detectors, and compare the scores with the paper's scores.
 
     Detectors of tags get boards of tags in the same scenes. The same command continues an interrupted run. The command
-    prints tables as Markdown. It writes a report per suite, and the scores and the predictions of each detector.
+    prints tables as Markdown. It also writes a report per suite, and the scores and predictions of each detector.
 
     \b
     Examples:
@@ -74,12 +74,12 @@ def bench(
     from kpbench.synth.suite_file import load_suite
 
     if quick and (images or size):
-        raise click.UsageError("--quick sets --images and --size; drop one of them")
+        raise click.UsageError("--quick already sets --images and --size; drop --quick, or drop --images and --size")
     if quick:
         images, size = 20, (640, 480)
     loaded = [load_suite(name) for name in suites]
     if len({suite.name for suite in loaded}) < len(loaded):
-        raise click.UsageError(f"suites of one name, {', '.join(s.name for s in loaded)}: their results would be mixed")
+        raise click.UsageError(f"two suites have the same name: {', '.join(s.name for s in loaded)}")
     configs = [SuiteConfig(suite, images, seed, size, only, backgrounds) for suite in loaded]
     try:
         with progress_bar(count_bench_images(configs, detectors), "bench") as progress:

@@ -20,7 +20,7 @@ from kpbench.cli.score import FILE, scoring_options
 def compare(files: tuple[Path, ...], fail_on_regression: bool, **arguments: Any) -> None:
     """Compare the first of several predictions files with each of the others, on the same dataset.
 
-    Differences are paired: the resamples for the 95 % intervals draw the same scenes for both detectors. With
+    Differences are paired: every resample for a 95 % interval draws the same scenes for both detectors. With
     --fail-on-regression, the exit code is 1 if the first detector has a lower detection score, a lower ID matching
     score or more false alarms over all images, and the interval of this difference does not contain 0.
 

@@ -49,6 +49,6 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
     for name, content in (
         ("print/patches.pdf", "the print sheet"),
         ("contact-sheet.png", "images with their true keypoints"),
-        ("scores.json", "the scores, all of them"),
+        ("scores.json", "all scores"),
     ):
         click.echo(f"  {out / name}  {content}")

@@ -10,7 +10,7 @@ from kpbench.cli.messages import print_warning
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
-"""Detectors that look for the shipped designs. Of these, only template looks for other designs, with --patches."""
+"""Detectors that look for the shipped designs only. With --patches, template looks for the given designs instead."""
 
 
 @click.command()
@@ -36,7 +36,7 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 @click.option(
     "--overlay",
     type=click.Path(path_type=Path),
-    help="Draw the detections: into a folder, a video (.mp4), or for a single image a .png.",
+    help="Draw the detections into a folder, into a video (.mp4), or for a single image into a .png file.",
 )
 @PATCHES
 @WORKERS
@@ -76,7 +76,7 @@ def detect(
     if detector in SHIPPED_DESIGNS_ONLY and not patches and has_other_designs(images):
         print_warning(
             f"{source} holds other designs than {detector} looks for; use template with `patches`, "
-            "or weights trained on them"
+            "or weights trained on the other designs"
         )
     loaded = load_detector(detector, threshold, load_patches(patches)) if patches else detector
     try:
@@ -89,5 +89,5 @@ def detect(
     if run.failures:
         for label, problem in run.failures[:5]:
             print_warning(f"{label}: {problem}")
-        print_warning(f"{len(run.failures)} images failed, they count as no detections")
+        print_warning(f"{len(run.failures)} images failed and count as images without detections")
         raise SystemExit(1)

@@ -18,8 +18,8 @@ def name_options(message: str, command: click.Command | None) -> str:
     """Translate parameters that the library names in backticks into options and arguments of a command.
 
     `n` becomes --n, `limits.radius_px` becomes --radius-px, `resume=True` becomes --resume, and `channels=3` becomes
-    --channels 3. `parts` becomes PARTS if the command has this argument. Other text in backticks stays, such as a
-    metric or another command.
+    --channels 3. `parts` becomes PARTS if the command has this argument. Other text in backticks is not changed, such
+    as a metric or another command.
     """
     if command is None:
         return message

@@ -38,7 +38,7 @@ class Names(click.ParamType[tuple[str, ...]]):
 
 
 class Finite(click.FloatRange):
-    """A number within a range. Unlike ``click.FloatRange`` it refuses nan and infinity."""
+    """A number within a range. In contrast to ``click.FloatRange``, nan and infinity are refused."""
 
     def _describe_range(self) -> str:
         return "" if self.min is self.max is None else super()._describe_range()
@@ -89,7 +89,7 @@ PATCHES = click.option(
 
 
 def run_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a command that writes a dataset: where shards are made, and what happens to an earlier run."""
+    """Add the options of a command that writes a dataset: where shards are made, and which are kept."""
     for option in reversed((
         WORKERS,
         click.option(

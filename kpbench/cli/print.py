@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 @click.option(
     "--measured",
     type=Two(float, "X_MM,Y_MM", ",", "99.8,100.1"),
-    help="Measured lengths of the two rulers on the paper. Correct the sidecars in --out instead of printing.",
+    help="Lengths of the x ruler and the y ruler, measured on the paper. Correct the sidecars in --out; print nothing.",
 )
 @click.pass_context
 def render_patches(
@@ -85,8 +85,8 @@ def render_patches(
 ) -> None:
     """Print the patches or a board, true to scale.
 
-    The command writes ./patches-print/patches.pdf, and patches.json with the position of every keypoint. Print the PDF
-    at 100 %, then measure the two rulers on the paper.
+    By default, the command writes ./patches-print/patches.pdf, and patches.json with the position of every keypoint.
+    Print the PDF at 100 %, then measure the two rulers on the paper.
 
     \b
     Examples:

@@ -33,7 +33,7 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--images",
     type=int,
-    help="Number of base scenes. Each is rendered with every patch under every rung. "
+    help="Number of base scenes. Each scene is rendered with every patch under every rung. "
     "Default: 500 for shipped suites, else as in the .toml file.",
 )
 @SEED

@@ -1,4 +1,4 @@
-"""``kpbench synth`` and ``merge``, and the function with which commands write a dataset."""
+"""``kpbench synth`` and ``merge``, and the function that writes a dataset for ``synth`` and ``suite``."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 @click.option(
     "--augment",
     type=click.Path(path_type=Path),
-    help="Your own albumentations pipeline, a file of albumentations.save (JSON or YAML). Applied last.",
+    help="File with your own albumentations pipeline, made by albumentations.save (JSON or YAML). Applied last.",
 )
 @click.option(
     "--shard-size", type=int, default=500, show_default=True, help="Number of images per shard. A shard is one file."

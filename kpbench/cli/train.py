@@ -14,9 +14,9 @@ from kpbench.cli.options import BACKGROUNDS, PATCHES
 EPOCHS = {"ellipse": 6, "judges": 10}
 """Default of --epochs for each choice of --verifier."""
 VERIFIER_ONLY = {"datasets", "test", "epochs", "detector"}
-"""Parameters for training with --verifier only."""
+"""Parameters that are accepted only with --verifier."""
 SHARED = {"verifier", "out", "init", "workers", "threads"}
-"""Parameters for training with and without --verifier."""
+"""Parameters that are accepted with and without --verifier."""
 
 
 @contextmanager
@@ -40,7 +40,7 @@ def _needs_torch(command: str) -> Iterator[None]:
 @click.option(
     "--test",
     type=click.Path(path_type=Path),
-    help="With --verifier: dataset for the report, and for the calibration of ellipse.",
+    help="With --verifier: dataset for the report, and for the calibration of the ellipse network.",
 )
 @click.option(
     "--epochs",
@@ -63,16 +63,16 @@ def _needs_torch(command: str) -> Iterator[None]:
 @click.option(
     "--init",
     help="Initial weights: superpoint or superpoint-small (shipped), an exported .onnx, a checkpoint, or SuperPoint's "
-    "published weights (.pth, .safetensors). With --verifier: shipped. Default: random weights.",
+    "published weights (.pth, .safetensors). With --verifier, the only choice is: shipped. Default: random weights.",
 )
-@click.option("--resume", is_flag=True, help="Continue from the checkpoint in --out. --init is not used.")
+@click.option("--resume", is_flag=True, help="Continue from the checkpoint in --out; --init is ignored.")
 @click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time. Continue later with --resume.")
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
     help="Number of processes that make samples. Default: 1; with --verifier: one per core.",
 )
-@click.option("--threads", type=click.IntRange(min=1), help="Number of PyTorch's threads. Default: chosen by PyTorch.")
+@click.option("--threads", type=click.IntRange(min=1), help="Number of PyTorch threads. Default: chosen by PyTorch.")
 @click.option("--tensorboard", is_flag=True, help="Also write the log for TensorBoard.")
 @click.pass_context
 def train(
@@ -95,9 +95,9 @@ def train(
 ) -> None:
     """Train the detector's network by a recipe, or the networks that verify its candidates.
 
-    The detector is trained on samples that are made on the fly. An interrupted run can be resumed; on a CPU, the
-    result is the same to the bit. The verifier is trained on synthetic DATASETs. Its training writes ellipse.onnx, or
-    first-judge.onnx and second-judge.onnx.
+    The detector is trained on samples that are made on the fly. An interrupted run can be resumed. On a CPU, a resumed
+    run gives the same bits as an uninterrupted run. The verifier is trained on synthetic DATASETs. Its training writes
+    ellipse.onnx, or first-judge.onnx and second-judge.onnx.
 
     \b
     Examples:
@@ -199,7 +199,7 @@ def _train_verifier(
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="ONNX file to write.")
 @click.option("--int8", is_flag=True, help="Convert an exported ONNX file to 8-bit integers, for CPUs.")
 def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
-    """Write the trained network as one ONNX file, and compare the output of the file with PyTorch's.
+    """Write the trained network as one ONNX file, and compare its output with PyTorch's output.
 
     With --int8, CHECKPOINT is an ONNX file that export-model wrote.
 

@@ -1,4 +1,4 @@
-"""The content of a dataset for people: facts, histograms, an overview picture, and the dataset card."""
+"""Descriptions of a dataset for people: facts, histograms, an overview picture, and the dataset card."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CARD_MARK = "kpbench.card/1"
 SIZE_CATEGORIES = (
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
 )  # fmt: skip
-"""Limits, and the Hugging Face hub's name for datasets with fewer images than each limit."""
+"""Pairs (limit, category): the Hugging Face hub's category of datasets with fewer images than the limit."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def dataset_facts(dataset: Dataset) -> dict[str, str]:
 
 
 def dataset_histograms(dataset: Dataset) -> list[Histogram]:
-    """Return the distributions of designs, counts, sizes, tilts, contrasts and visible fractions.
+    """Return histograms: keypoints per image, patch IDs, sizes, tilts, contrasts and visible fractions.
 
     Examples
     --------
@@ -117,7 +117,7 @@ def dataset_histograms(dataset: Dataset) -> list[Histogram]:
         by_id,
         _bin_values("radius (major semi-axis), px", major, [0, 5, 8, 12, 20, 32, 50, 80, np.inf]),
         _bin_values("short axis (full length), px", 2 * minor, [0, 10, 16, 24, 40, 64, 100, 160, np.inf]),
-        _bin_values("tilt by the axes, acos(minor / major), degrees", tilt_deg, [0, 15, 30, 45, 60, 75, 90]),
+        _bin_values("tilt, acos(minor / major semi-axis), degrees", tilt_deg, [0, 15, 30, 45, 60, 75, 90]),
         _bin_values("contrast, grey levels", keypoints["contrast"], [-np.inf, 0, 25, 50, 100, 150, 200, 256]),
         _bin_values("visible fraction", keypoints["visible"], [0, 0.5, 0.75, 0.99, 1.01]),
     ]
@@ -168,7 +168,7 @@ def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int
 def write_card(dataset: Dataset, folder: Path) -> None:
     """Write the dataset card into a folder: ``README.md`` with the header that dataset hubs read, and ``preview.png``.
 
-    Either file stays as it is if kpbench did not write it.
+    A file that kpbench did not write is not replaced.
 
     Raises
     ------
@@ -199,8 +199,8 @@ tags: [keypoint-patches, simulated]
 |---|---|
 {facts}
 
-The images are simulated by kpbench; each is a function of the configuration in `dataset.json`, the seed and the
-background files. Where those are photographs, their licence holds for what is seen of them here.
+The images are simulated by kpbench. The configuration in `dataset.json` and the background files determine every image.
+If the background files are photographs, their licence also holds for these images.
 
 ```python
 import kpbench

@@ -38,15 +38,15 @@ class DatasetConfig(Protocol):
         ...
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the configuration as written into the dataset, without any path."""
+        """Return the configuration as it is written into the dataset, without any path."""
         ...
 
     def scene_id(self, index: int) -> int:
-        """Return the base scene of an image. Shards are made scene by scene, so that a scene's background is reused."""
+        """Return the ID of an image's base scene. Shards are made scene by scene, to reuse the scene's background."""
         ...
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
-        """Make one image. Return the image as a sample, and the background files that could not be decoded."""
+        """Make one image. Return the sample, and the paths of the background files that could not be decoded."""
         ...
 
     def __hash__(self) -> int: ...

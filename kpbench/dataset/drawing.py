@@ -14,7 +14,7 @@ from kpbench.types import Detections, UInt8
 PATCH_COLOURS = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (213, 94, 0), (204, 121, 167))
 """RGB colours of the patch IDs, distinct to colour-blind eyes (Okabe and Ito, *Color universal design*, 2008)."""
 OUTERMOST_PX = 1e6
-"""Largest coordinate that is drawn, px. OpenCV stores coordinates in units of 1/16 px in 32 bits."""
+"""Largest coordinate that is drawn, px. Larger values can overflow: OpenCV has 32 bits for a coordinate in 1/16 px."""
 
 
 def _to_sixteenths(*lengths_px: float) -> tuple[int, ...]:
@@ -50,7 +50,7 @@ def draw_keypoints(image: UInt8, keypoints: NDArray[Any], scale: float = 1.0) ->
     if canvas.ndim == 2:
         canvas = cv2.cvtColor(canvas, cv2.COLOR_GRAY2RGB)
     for k in keypoints:
-        # scaling is about the corner of the image, half a pixel left of and above the centre of pixel (0, 0)
+        # scaling keeps the corner of the image in place, half a pixel left of and above the centre of pixel (0, 0)
         x, y = (float(k["x"]) + 0.5) * scale - 0.5, (float(k["y"]) + 0.5) * scale - 0.5
         major, minor = (float(k["radius_major"]) + 2) * scale, (float(k["radius_minor"]) + 2) * scale
         colour, angle_deg = PATCH_COLOURS[int(k["patch_id"]) % len(PATCH_COLOURS)], float(k["axis_angle"])
@@ -103,7 +103,7 @@ def draw_detections(image: UInt8, detections: Detections) -> UInt8:
 
 
 def contact_sheet(tiles: Sequence[UInt8], columns: int, gap_px: int = 4) -> UInt8:
-    """Lay tiles of one size side by side in rows, on white.
+    """Arrange tiles of equal size in rows on a white sheet.
 
     Parameters
     ----------

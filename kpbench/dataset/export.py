@@ -27,7 +27,7 @@ from kpbench.workers import Progress
 from kpbench.writing import write_file
 
 EXPORT_MARK = "kpbench.export/1"
-"""Mark of the file that names all other files of an export."""
+"""Mark in the main file of an export to COCO or YOLO."""
 
 
 def export_dataset(
@@ -86,7 +86,7 @@ def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
 
 
 def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
-    """Write COCO keypoints. Each design is a category with one keypoint. Annotations also hold columns of kpbench."""
+    """Write COCO keypoints. Each design is a category with one keypoint. Annotations also hold kpbench's columns."""
     (folder / "images").mkdir()
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
@@ -116,7 +116,7 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         {"id": patch_id + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
         for patch_id, name in patch_names(dataset).items()
     ]
-    # `kpbench score` compares the fingerprint
+    # `kpbench score` compares this fingerprint with the fingerprint in the predictions
     info = {"description": f"kpbench dataset ({EXPORT_MARK})", "fingerprint": dataset.fingerprint}
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
     write_file(folder / "annotations.json", json.dumps(content).encode())
@@ -133,7 +133,7 @@ def _scoring_groups(dataset: Dataset, n: int) -> dict[str, Any]:
 
 
 def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
-    """Write YOLO-pose: one text file per image, with all lengths as fractions of the image."""
+    """Write YOLO-pose: one text file per image, with lengths as fractions of the image's width or height."""
     for name in ("images", "labels"):
         (folder / name).mkdir()
     ids = dataset.truth.image_id

@@ -71,7 +71,7 @@ def write_manifest(
         "fingerprint": fingerprint,
         "seed": config.get("seed"),
         "images": sum(shard.count for shard in shards),
-        "config": json.loads(canonical_json(config)),  # keys in sorted order, whatever their order in ``config``
+        "config": json.loads(canonical_json(config)),  # sorts the keys
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }
@@ -151,20 +151,20 @@ class Dataset:
         return self._open(n), index - self.shards[n].first, self.path / self.shards[n].file
 
     def image(self, index: int) -> UInt8:
-        """Return an image by its number in the dataset, from 0: uint8 (H, W) or (H, W, 3)."""
+        """Return image number ``index``, counted from 0, as a uint8 array of shape (H, W) or (H, W, 3)."""
         file, row, path = self._locate(index)
         with shard_errors(path):
             return np.asarray(file["images"][row])
 
     def keypoints(self, index: int) -> NDArray[Any]:
-        """Return the true keypoints of the image at a position, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
+        """Return the true keypoints of image number ``index``, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
         file, row, path = self._locate(index)
         with shard_errors(path):
             low, high = file["offsets"][row : row + 2]
             return np.asarray(file["keypoints"][low:high])
 
     def effects(self, index: int) -> list[dict[str, Any]]:
-        """Return the records of the effects that degraded the image at a position, in order."""
+        """Return the records of the effects that degraded image number ``index``, in the order of application."""
         file, row, path = self._locate(index)
         with shard_errors(path):
             return list(json.loads(file["degradations"].asstr()[row]))
@@ -194,7 +194,8 @@ class Dataset:
         Raises
         ------
         DataError
-            At the first shard that is missing, differs in a byte, or cannot be read.
+            If the manifest's fingerprint is wrong. At the first shard that is missing, differs in a byte, or cannot be
+            read.
         """
         if compute_fingerprint(self.config, self.shards) != self.fingerprint:
             raise DataError(f"{self.path / MANIFEST}: its fingerprint does not fit its config and shards")

@@ -1,7 +1,7 @@
-"""Making datasets: plan the shards, keep finished shards, make the missing shards, write the manifest last.
+"""Make datasets: plan the shards, keep finished shards, make the missing shards, write the manifest last.
 
-A shard is a function of the configuration and of the shard's place in the dataset. Any process can therefore make a
-shard, at any time and in any run. An interrupted run can be resumed. Parts that were made on several machines can be
+The configuration and a shard's place in the dataset determine the shard. Any process can therefore make a shard, at
+any time and in any run. An interrupted run can be resumed. Parts that were made on several machines can be
 merged.
 """
 
@@ -84,20 +84,20 @@ def generate(
     Parameters
     ----------
     config : DatasetConfig
-        Such as :class:`kpbench.SynthConfig` or :class:`kpbench.SuiteConfig`.
+        Configuration such as :class:`kpbench.SynthConfig` or :class:`kpbench.SuiteConfig`.
     out : str or Path
         Folder, or a URL that fsspec reaches, such as ``s3://bucket/name``. A missing folder is made.
     workers : int or None
         Number of worker processes, None for one per core. With 1, this process makes all shards.
     executor : concurrent.futures.Executor, optional
         Executor that makes the shards instead of worker processes. The workers of the executor must find the folder and
-        the backgrounds under the same paths.
+        the backgrounds under the same paths as this process.
     scheduler : str, optional
         Address of a Dask scheduler, such as ``tcp://host:8786``, whose workers make the shards.
     resume : bool
         Keep the finished shards of an interrupted run, and make the others.
     overwrite : bool
-        First delete the dataset that is in the folder.
+        Delete the dataset in the folder first.
     progress : callable
         Called with the number of images finished since its last call.
 
@@ -160,7 +160,7 @@ def generate_part(
     Raises
     ------
     DataError
-        If the dataset does not have these shards, and in all cases of :func:`generate`.
+        If the dataset does not have these shards, or in a case that :func:`generate` lists.
 
     Examples
     --------
@@ -192,7 +192,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     Parameters
     ----------
     out : str or Path
-        Folder of the dataset; it may hold shards already.
+        Folder of the dataset. The folder may already hold shards.
     parts : sequence of (str or Path)
         Folders whose shards are linked or copied into ``out``.
 
@@ -328,7 +328,7 @@ def _format_bytes(count: float) -> str:
 
 
 def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:
-    """Return the versions of software that can change pixels, and the broken files, equal for equal runs."""
+    """Return the versions of software that can change pixels, and the broken files. Equal runs give equal results."""
     libraries = ("kpbench", "numpy", "opencv-python-headless", "albumentations", "h5py", "deflate")
     return {
         "versions": {
@@ -340,7 +340,7 @@ def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:
 
 
 _one_shard_at_a_time = threading.Lock()
-"""An executor may run several threads in one process, but caches and albumentations' generators are not thread-safe."""
+"""Lock for the threads of an executor: caches and albumentations' random generators are not thread-safe."""
 
 
 def _make_shard(
@@ -366,5 +366,5 @@ def _make_shard(
 
 @cache
 def _config_of_process(config: DatasetConfig) -> DatasetConfig:
-    """Return one config object per process. All shards then share the object's cache of decoded photographs."""
+    """Return the same object for equal configs in a process. All shards then share its cache of photographs."""
     return config

@@ -22,7 +22,7 @@ from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
 LOCK_FILE = ".kpbench.lock"
 LONGEST_VALUE = 40
-"""An error message shows the values of a config only if their texts are shorter than this."""
+"""An error message shows two different values of a key only if each value has fewer characters than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
 """What a user can do about a folder that holds another dataset."""
 
@@ -46,7 +46,7 @@ class FinishedShard:
 
 @dataclass(frozen=True)
 class ShardHead:
-    """The dataset that a shard belongs to, and the shard's place in the dataset."""
+    """The dataset's config as JSON, the background files that could not be decoded, and the image IDs of a shard."""
 
     config: str
     broken_files: tuple[str, ...]
@@ -82,8 +82,8 @@ def prepare_folder(
     Raises
     ------
     DataError
-        If the folder holds files that are not of a dataset. If the folder holds a dataset or planned shards, and
-        neither ``resume`` nor ``overwrite`` is set. If :func:`find_finished_shards` raises the error.
+        If the folder holds files, but neither a manifest nor shards. If the folder holds a manifest or planned shards,
+        and neither ``resume`` nor ``overwrite`` is set. If a shard belongs to another dataset or is damaged.
     """
     manifest, names = folder / MANIFEST, {shard.file for shard in plan}
     entries = [path for path in folder.glob("*") if not path.name.startswith(".")]
@@ -156,7 +156,7 @@ def find_finished_shards(
 
 
 def read_shard_head(path: Path) -> ShardHead:
-    """Open a shard and read the dataset's config (as text) and the shard's place in the dataset."""
+    """Open a shard, and return the facts that tell to which dataset and to which place in it the shard belongs."""
     with open_shard(path) as file:
         ids = file["image_id"][:]
         broken_files = tuple(json.loads(read_text_attribute(file, "broken_backgrounds")))
@@ -209,7 +209,7 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     folder : Path
         A folder at a URL is not locked: object stores have no locks.
     shared : bool
-        Allow other runs with a shared lock at the same time. Each run must write other shards.
+        Allow other runs with a shared lock at the same time. No two of these runs may write the same shard.
 
     Raises
     ------
@@ -233,11 +233,11 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     with file:
         try:
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # deleted between open and flock
+            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # another run deleted the file before flock
                 raise BlockingIOError
         except (BlockingIOError, FileNotFoundError):
             raise DataError(f"{folder}: another kpbench run is writing to it") from None
-        except OSError:  # a file system without locks, such as some of the network
+        except OSError:  # a file system without locks, such as some network file systems
             warnings.warn(f"{folder}: cannot be locked; let no other run write to it", KpbenchWarning, stacklevel=2)
         try:
             yield

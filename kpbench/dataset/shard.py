@@ -24,7 +24,7 @@ from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
-"""Level of libdeflate. Unlike libdeflate, ISA-L, zlib-ng and zlib-rs may give different bytes for the same input."""
+"""Level of libdeflate, which always gives the same bytes for the same input. ISA-L, zlib-ng and zlib-rs may not."""
 MOST_INFLATION = 1100
 """Largest accepted ratio of unpacked to packed bytes. Deflate reaches at most 1032."""
 SHARD_COLUMNS = (
@@ -42,7 +42,7 @@ SHARD_COLUMNS = (
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled image on its way into a shard.
+    """One labelled image, before it is written into a shard.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Sample:
     effects : list of dict
         Records of the degradations, in order.
     background : str
-        Path of the photograph below its folder, "" for a procedural background.
+        Path of the photograph relative to the folder of photographs; "" for a procedural background.
     condition : str
-        "" if the image belongs to no condition.
+        Name of the condition; "" if the image belongs to no condition.
     rung : float
-        nan if the image belongs to no condition.
+        Rung of the condition; nan if the image belongs to no condition.
     scene_id : int
-        ID of the base scene, the same for all images of the scene. -1 if the image is a scene of its own.
+        ID of the base scene, the same for all images of the scene. -1 if no other image shows the scene.
 
     Examples
     --------
@@ -109,9 +109,9 @@ def encode_shard(
         If there are no samples, or their images differ in shape.
     """
     buffer = io.BytesIO()
-    # File structures of v110 carry checksums, so that reading also finds a flipped byte outside the data. Only the heap
-    # of variable-length strings has no checksum, and HDF5 can loop for ever over a damaged heap. Text is therefore
-    # stored in fixed length.
+    # HDF5's file structures of v110 have checksums, so that reading also finds a flipped byte outside the data. Only
+    # the heap of variable-length strings has no checksum, and HDF5 can loop for ever over a damaged heap. Text is
+    # therefore stored in fixed length.
     # Without a chunk cache, a column gets its place in the file when the column is written. With a cache, the column
     # would get its place when Python frees the h5py object, at a time that depends on other threads.
     with h5py.File(buffer, "w", libver=("v110", "v110"), rdcc_nbytes=0) as file:
@@ -163,7 +163,7 @@ def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Samp
 
 
 def _fixed_text_type(encoded: Sequence[bytes]) -> Any:
-    """Return HDF5's type for UTF-8 text of a fixed length. The length is that of the longest text."""
+    """Return HDF5's type for UTF-8 text of a fixed length. The length is the number of bytes of the longest text."""
     return h5py.string_dtype("utf-8", max(len(text) for text in [b"-", *encoded]))
 
 

@@ -19,10 +19,10 @@ from kpbench.geometry.outline import cos_sin_deg
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float
 
-# 16 px, as in the paper, if the board fills 0.5 % of the image
+# A board that covers 0.5 % of a 1624 x 1240 px image has a side of 100 px. Its discs are 16 px wide, as in the paper.
 HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
-TOUCHING_MM = 1e-6  # allowed overlap: rounding errors must not turn patches that touch into an error
+TOUCHING_MM = 1e-6  # tolerated overlap: rounding errors can make patches that touch overlap by less than this
 
 
 class BoardPoint(Protocol):
@@ -135,13 +135,13 @@ class Board:
     side_x_mm, side_y_mm : float
         Width and height.
     keypoints : tuple of BoardKeypoint
-        At least one.
+        At least one keypoint.
 
     Raises
     ------
     DesignError
-        If the board has no keypoint, a patch reaches over the edge, two patches overlap, or two different designs share
-        an id.
+        If the board has no keypoint, a patch reaches over the edge of the board, two patches overlap, or two different
+        designs share an id.
 
     Examples
     --------
@@ -182,7 +182,7 @@ class Board:
 
     @property
     def patches(self) -> tuple[Patch, ...]:
-        """Different designs on the board, in the order of their ids."""
+        """Designs on the board, each design once, in the order of their ids."""
         return tuple(p for _, p in sorted({k.patch.patch_id: k.patch for k in self.keypoints}.items()))
 
     @property
@@ -191,20 +191,20 @@ class Board:
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """Return the outlines of all black ink, and of the discs, as polygons in mm of the board frame.
+        """Return the outlines of all black ink, and of the whole patches, as polygons in mm of the board frame.
 
         Parameters
         ----------
         radius_px : ndarray of shape (n,)
-            Radius of each keypoint's disc in the image, px. In the image, the polygons deviate from the exact curves by
-            at most 1/1000 px.
+            Radius of each keypoint's disc in the image, px. The radii set the number of corners: in the image, the
+            polygons deviate from the exact curves by at most 1/1000 px.
 
         Returns
         -------
         parts : list of lists of ndarray of shape (N, 2)
-            Polygons of each part of the ink. Each patch is one part. Parts do not overlap.
+            Polygons of each part of the ink. The ink of each patch is one part. Parts do not overlap.
         discs : list of lists of ndarray of shape (N, 2)
-            Polygons of each keypoint's disc, rim and quiet zone included.
+            Polygons of each whole patch, rim and quiet zone included.
         """
         parts, discs = [], []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
@@ -216,7 +216,10 @@ class Board:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the size of the board, its designs and their places, rounded to 1 nm. Names are not hashed."""
+        """SHA-256 of the board's size, and of each patch's design, place, rotation and diameter.
+
+        Lengths are rounded to 1 nm, and rotations to 1e-6 degrees. Names are not hashed.
+        """
         lengths: list[tuple[float, ...]] = [(self.side_x_mm, self.side_y_mm)]
         lengths += [(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints]
         patches = [(k.patch.patch_id, k.patch.digest) for k in self.keypoints]
@@ -227,8 +230,8 @@ class Board:
 def hexagon_board(patch: Patch, side_mm: float) -> Board:
     """Return the paper's board: six patches of one design on a regular hexagon.
 
-    The board is a square of side S. The discs have a diameter of 0.16 S. Their centres have a distance of 0.36 S from
-    the board's centre. The first patch is on the right; the others follow clockwise.
+    The board is a square of side S. The discs have a diameter of 0.16 S. The centres of the discs lie 0.36 S from the
+    board's centre. The first patch is on the right. The other patches follow clockwise.
 
     Parameters
     ----------
@@ -239,7 +242,7 @@ def hexagon_board(patch: Patch, side_mm: float) -> Board:
     Raises
     ------
     DesignError
-        If rim and quiet zone are so wide that patches overlap or leave the board.
+        If rim and quiet zone are so wide that patches overlap or reach over the edge of the board.
 
     Examples
     --------
@@ -257,10 +260,11 @@ def hexagon_board(patch: Patch, side_mm: float) -> Board:
 def grid_board(
     patches: Sequence[Patch], rows: int, columns: int, diameter_mm: float, pitch_mm: float, name: str = "grid"
 ) -> Board:
-    """Return a board with patches in rows and columns, listed row by row from the top left.
+    """Return a board with patches in rows and columns. The keypoints are listed row by row from the top left.
 
-    The patch in row r and column c is ``patches[(r + c) % len(patches)]``. With two or more designs, neighbours
-    therefore differ. The board is ``columns * pitch_mm`` wide and ``rows * pitch_mm`` high.
+    The patch in row r and column c is ``patches[(r + c) % len(patches)]``. With two or more designs, neighbours in a
+    row or a column therefore have different designs. The board is ``columns * pitch_mm`` wide and ``rows * pitch_mm``
+    high.
 
     Parameters
     ----------
@@ -269,13 +273,13 @@ def grid_board(
     diameter_mm : float
         Diameter of the discs.
     pitch_mm : float
-        Distance between the centres of neighbours.
+        Distance between the centres of neighbours in a row or a column.
     name : str
 
     Raises
     ------
     DesignError
-        If patches overlap or leave the board, or two different designs share an id.
+        If patches overlap or reach over the edge of the board, or two different designs share an id.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Boards as TOML files: a grid of designs, or a list of keypoints."""
+"""Read boards from TOML files. A file describes a grid of designs, or a list of keypoints."""
 
 from __future__ import annotations
 
@@ -56,16 +56,17 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
     ----------
     path : str or Path
     patches : sequence of Patch, optional
-        Designs that the keypoints may name. Default: the designs in the files that the key ``designs`` lists, relative
-        to the board's file. Without that key: the shipped designs.
+        Designs that the board may use. Default: the designs in the files that the key ``designs`` lists, with paths
+        relative to the folder of the board's file. If the key is missing, the default is the shipped designs.
     diameter_mm : float, optional
         Diameter of each disc whose diameter is not set in the file. Default: 30.
 
     Raises
     ------
     DesignError
-        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. The message
-        names the file, the key and what was expected.
+        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. If
+        ``designs`` or ``diameter_mm`` is set both in the file and by a parameter. The message names the file, the key
+        and what was expected.
 
     Examples
     --------
@@ -93,7 +94,7 @@ def parse_board(
         if not all(isinstance(file, str) for file in files):
             raise table.problem("designs", "a list of file names")
         if patches is not None:
-            raise DesignError("the file sets the key designs, and other designs are given; drop the key or the designs")
+            raise DesignError("the file sets the key designs, and other designs are given; drop the key or the others")
         patches = load_patches([path.parent / file for file in files])
     elif patches is None:
         patches = shipped_patches()

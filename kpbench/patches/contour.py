@@ -1,8 +1,8 @@
 """Outline of a design's black cells, as exact contours of straight lines and arcs.
 
 A design is a polar chequer of rings and sectors, see :class:`kpbench.patches.Patch`. A *node* is a pair of indices
-(radius, angle). All nodes at radius 0 are one node, the centre. A *border* of a cell is a line or an arc from one node
-to the next node.
+(radius, angle). All nodes at radius 0 are one node, the centre. The corners of a cell are nodes. A *border* of a cell
+is a line or an arc from one corner to the next corner.
 """
 
 from __future__ import annotations
@@ -15,7 +15,9 @@ from kpbench.types import Float
 
 Node = tuple[int, int]
 Border = tuple[Node, Node, str]
-"""First node, last node, and a name such as ``line0,3`` or ``arc1,2``. Borders of the same nodes differ in name."""
+"""First node, last node, and a name such as ``line0,3`` or ``arc1,2``.
+
+Borders with the same two nodes have different names."""
 
 
 def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Region:
@@ -24,9 +26,9 @@ def trace_contours(radii: Float, angles: Float, black: NDArray[np.bool_]) -> Reg
     Parameters
     ----------
     radii : ndarray of shape (R + 1,)
-        Radii between which the rings lie, ascending from 0.
+        Radii that bound the rings, ascending from 0.
     angles : ndarray of shape (A,)
-        Angles between which the sectors lie, in degrees, ascending in [0, 360).
+        Angles that bound the sectors, in degrees, ascending in [0, 360).
     black : ndarray of shape (R, A), bool
         Whether each cell is black.
     """
@@ -89,10 +91,10 @@ def _chain(borders: dict[Border, float], radii: Float, angles: Float) -> Region:
 def _next_border(arriving: Border, choices: list[Border], angles: Float) -> int:
     """Return the index of the border that continues the arriving border around the same ink.
 
-    Several borders leave a node where black cells touch at a point only. Outside the centre, the contour of a cell
-    turns there from a line to an arc, or from an arc to a line. At the centre, the ink lies anticlockwise of the
-    arriving line and clockwise of a leaving line. The line that leaves around the same ink is therefore the nearest
-    line anticlockwise of the arriving line.
+    Several borders leave a node if black cells touch at this node only. At a node other than the centre, the contour of
+    a cell turns from a line to an arc, or from an arc to a line. At the centre, the ink lies anticlockwise of the
+    arriving line and clockwise of a leaving line, as seen on the patch. The line that leaves around the same ink is
+    therefore the nearest line anticlockwise of the arriving line.
     """
     if arriving[1][0] != 0 or len(choices) == 1:
         return next((n for n, c in enumerate(choices) if c[2][:3] != arriving[2][:3]), 0)
@@ -110,8 +112,8 @@ def _segment(border: Border, sweep: float, radii: Float, angles: Float) -> Line 
 
 
 def _merge(contour: list[Line | Arc]) -> Contour:
-    """Join arcs that continue each other. Lines that meet at the centre are not joined."""
-    for _ in contour:  # rotate the contour until its first arc does not continue its last arc
+    """Join successive arcs that have the same radius and direction. Lines are not joined."""
+    for _ in contour:  # rotate the contour until its first segment does not continue its last segment
         if isinstance(contour[0], Arc) and isinstance(contour[-1], Arc) and _continues(contour[-1], contour[0]):
             contour = contour[1:] + contour[:1]
     merged: list[Line | Arc] = []

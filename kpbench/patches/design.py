@@ -1,7 +1,7 @@
 """Designs of patches: read from TOML, and turned into exact outlines.
 
-A patch starts as a disc of radius 1 in a single ink. Semi-circles about the disc's centre are painted onto the disc in
-order. A semi-circle is black, or white, or inverts the ink below. The result is always a polar chequer
+A patch starts as a disc of radius 1 in a single ink. Semi-circles about the disc's centre are painted onto the disc
+one after the other. A semi-circle is black, or white, or inverts the ink below. The result is always a polar chequer
 (:attr:`Patch.cells`). Radii divide the chequer into rings, and angles divide the chequer into sectors. Each cell is
 black or white.
 """
@@ -38,9 +38,9 @@ class SemiCircle:
     Attributes
     ----------
     radius : float
-        As a fraction of the disc's radius.
+        Radius as a fraction of the disc's radius.
     start_deg : float
-        The semi-circle spans the angles from ``start_deg`` to ``start_deg + 180``, from +u towards +v.
+        The semi-circle spans the angles from ``start_deg`` to ``start_deg + 180``. Angles grow from +u towards +v.
     ink : str
         "black", "white" or "invert".
 
@@ -73,11 +73,11 @@ class Patch:
     semicircles : tuple of SemiCircle
         Painted in this order.
     rim : float
-        Width of a ring around the disc, as a fraction of the disc's radius; 0 for none.
+        Width of the ring around the disc, as a fraction of the disc's radius; 0 for no rim.
     rim_ink : str
         Ink of the rim, "black" or "white".
     quiet_zone : float
-        Width of a white ring around the rim, as a fraction of the disc's radius; 0 for none.
+        Width of the white ring around the rim, as a fraction of the disc's radius; 0 for no quiet zone.
 
     Examples
     --------
@@ -104,13 +104,14 @@ class Patch:
     def cells(self) -> tuple[Float, Float, NDArray[np.bool_]]:
         """The polar chequer (radii, angles_deg, black).
 
-        * ``radii``, ndarray of shape (R + 1,): radii between which the rings lie, ascending from 0.
-        * ``angles_deg``, ndarray of shape (A,): angles between which the sectors lie, ascending in [0, 360).
-        * ``black``, ndarray of shape (R, A), bool: ``black[i, j]`` tells whether the cell between the radii i and i + 1
-          and between the angles j and j + 1 is black. The last sector ends at the first angle.
+        * ``radii``, ndarray of shape (R + 1,): radii that bound the rings, ascending from 0.
+        * ``angles_deg``, ndarray of shape (A,): angles that bound the sectors, ascending in [0, 360).
+        * ``black``, ndarray of shape (R, A), bool: ``black[i, j]`` tells whether the cell between ``radii[i]`` and
+          ``radii[i + 1]`` and between ``angles_deg[j]`` and ``angles_deg[j + 1]`` is black. The last sector ends at the
+          first angle.
 
-        The disc has as few rings and sectors as possible: each border between two of them separates black from white
-        somewhere. The rim and the quiet zone are rings of their own, even beside a ring of the same ink.
+        The disc has as few rings and sectors as possible: between any two neighbouring rings or sectors, some cells
+        differ in colour. The rim and the quiet zone are rings of their own, even beside a ring of the same ink.
         """
         radii = np.unique([0.0, 1.0, *(s.radius for s in self.semicircles)])
         angles = np.unique(np.round([(s.start_deg + a) % 360.0 for s in self.semicircles for a in (0, 180)], 9))
@@ -166,7 +167,7 @@ class Patch:
     def centre_is_crossing(self) -> bool:
         """Whether straight edges of at least two directions meet at the centre.
 
-        Straight edges stay straight under every perspective. Edges of two directions therefore mark the centre exactly.
+        Straight edges stay straight under every homography. Edges of two directions therefore mark the centre exactly.
         Edges of a single direction leave the centre undetermined along that direction. If a design has only arcs, the
         centre can only be estimated from the arcs, and this estimate is biased under tilt.
         """
@@ -176,7 +177,7 @@ class Patch:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of :attr:`cells`. Designs with the same digest have identical prints."""
+        """SHA-256 of :attr:`cells`. Designs with the same digest have identical ink."""
         radii, angles, black = self.cells
         content = (np.round(radii, 9).tolist(), np.round(angles, 9).tolist(), black.astype(int).tolist())
         return hashlib.sha256(repr(content).encode()).hexdigest()
@@ -253,13 +254,13 @@ def load_patches(paths: Sequence[str | Path]) -> tuple[Patch, ...]:
     Returns
     -------
     tuple of Patch
-        In the order of their ids.
+        The designs in the order of their ids.
 
     Raises
     ------
     DesignError
-        If a file cannot be read, has an unknown key or a wrong value, two designs share an id, or a folder holds no
-        design. The message names the file, the key and what was expected.
+        If a file cannot be read, or has an unknown key or a wrong value. If two designs share an id. If a folder holds
+        no design. The message names the file, the key and what was expected.
 
     Examples
     --------

@@ -1,8 +1,8 @@
-"""Boards of tags (ArUco, AprilTag, ChArUco), for the same scenes as boards of patches.
+"""Boards of tags (ArUco, AprilTag, ChArUco), which can replace boards of patches in the same scenes.
 
 The keypoints are the corners of the tags, or the inner corners of the ChArUco pattern. A tag board is a square of black
-and white modules with a white border of at least one module. A tag board has at least six keypoints;
-:func:`kpbench.patches.hexagon_board` has six. The tags are as large as the square permits.
+and white modules with a white border of at least one module. A tag board has six or eight keypoints;
+:func:`kpbench.patches.hexagon_board` has six. The tags are as large as the square and its border permit.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ DICTIONARIES = {
     "apriltag": cv2.aruco.DICT_APRILTAG_36h11,
     "charuco": cv2.aruco.DICT_4X4_50,
 }
-TAGS_PER_BOARD = 2  # both tags lie on a diagonal and have eight corners together
+TAGS_PER_BOARD = 2  # the two tags lie on a diagonal of the board and have eight corners in all
 CHARUCO_SQUARES = (4, 3)  # columns and rows; the pattern has six inner corners
 SQUARE_MODULES, MARKER_MODULES = 8, 6  # side of a ChArUco square, and of the marker within the square, in modules
 
@@ -77,7 +77,7 @@ class TagBoard:
         Width and height, which are equal.
     keypoints : tuple of TagCorner
     black : ndarray of shape (n, n), bool
-        Modules of the whole board, row by row.
+        Whether each module of the board is black, row by row.
 
     Examples
     --------
@@ -114,7 +114,7 @@ class TagBoard:
 
 
 def tag_dictionary(board: str) -> cv2.aruco.Dictionary:
-    """Return OpenCV's dictionary from which a board takes its tags."""
+    """Return OpenCV's dictionary of the tags on a board."""
     return cv2.aruco.getPredefinedDictionary(DICTIONARIES[board])
 
 
@@ -127,8 +127,8 @@ def charuco_pattern() -> cv2.aruco.CharucoBoard:
 def tag_board(name: str, side_mm: float) -> TagBoard:
     """Return a board of tags on a square.
 
-    ``aruco`` and ``apriltag`` carry the tags 0 and 1. Corner c of tag t is keypoint 4 t + c; the corners of a tag run
-    clockwise from its top left. ``charuco`` has the six inner corners of 4 x 3 squares in OpenCV's order.
+    ``aruco`` and ``apriltag`` carry the tags 0 and 1. Corner c of tag t has the ID 4 t + c. The corners of a tag are
+    numbered clockwise from the top left. ``charuco`` has the six inner corners of 4 x 3 squares in OpenCV's order.
 
     Parameters
     ----------
@@ -154,7 +154,7 @@ def tag_board(name: str, side_mm: float) -> TagBoard:
 
 
 Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
-"""Modules of a board, and the position (x, y) of each keypoint id, in modules from the top-left corner of the board."""
+"""Whether each module is black; and by ID, the keypoints' positions (x, y) in modules from the board's top left."""
 
 
 def _two_tags(name: str) -> Modules:

@@ -1,4 +1,4 @@
-"""ASCII DXF of AutoCAD 2000 for laser and plotter, with exact arcs.
+"""ASCII DXF of AutoCAD 2000 for laser cutters and plotters, with exact arcs.
 
 The group codes and the required tables follow Autodesk's *DXF Reference*. A tag is a pair (group code, value). In the
 frame of DXF, **y points up**, and the origin is the bottom-left corner of the page.
@@ -15,7 +15,7 @@ from kpbench.printing.page import CUT, LAYERS, PRINT_MARK, Page, split_arc, star
 
 
 def to_dxf(page: Page) -> bytes:
-    """Return the page as DXF in mm. Contours are closed polylines. Arcs are stored exactly, as bulges.
+    """Return the page as DXF in mm. Contours are closed polylines. Arcs are stored exactly, as bulges of vertices.
 
     Parameters
     ----------
@@ -60,15 +60,18 @@ def _dxf_value(value: Any) -> str:
 def _dxf_text(text: str) -> str:
     """Return the text with escapes for characters outside ASCII.
 
-    An escape holds only four hexadecimal digits: characters from U+10000 up are dropped. ``%%`` would start a control
-    code, and becomes ``% %``.
+    An escape holds four hexadecimal digits. Characters from U+10000 up do not fit and are dropped. ``%%`` would start a
+    control code, and is written as ``% %``.
     """
     units = "".join(c if c.isascii() else f"\\U+{ord(c):04X}" for c in text if ord(c) < 0x10000)
     return units.replace("%%", "% %")
 
 
 def _dxf_vertices(contour: Contour, height: float) -> list[tuple[int, Any]]:
-    """Return the vertices of a contour. An arc has the bulge ``-tan(sweep / 4)``: minus, as y points up in DXF."""
+    """Return the vertices of a contour. The bulge of an arc is ``-tan(sweep / 4)``.
+
+    The sign is negative because y points up in DXF and down in the page frame.
+    """
     parts = [piece for part in contour for piece in split_arc(part, 180.0)]
     tags: list[tuple[int, Any]] = [(90, len(parts)), (70, 1), (43, 0.0)]
     for part in parts:

@@ -1,4 +1,4 @@
-"""Fonts of the text on a print: the fonts differ between file formats, the font sizes do not."""
+"""Fonts of the text on a print. Each file format has its own fonts. All file formats have the same font sizes."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ PDF_FONT = "Vera"
 FONT_SIZE = 2.2
 """Largest font size, mm."""
 SMALLEST_FOOT = 1.2
-"""Smallest font size of the foot of a page, mm. A foot that needs a smaller font joins the line on top instead."""
+"""Smallest font size of the foot of a page, mm. If the foot needs a smaller font, its text moves to the top line."""
 CHARACTER_WIDTH = 0.6
-"""Assumed width of a character, in font sizes. In all fonts in use, digits and lower case are no wider on average."""
+"""Assumed mean width of a character, as a fraction of the font size. No font in use has a larger mean width."""
 
 
 def font_size(text: str, width: float) -> float:
-    """Return the font size, from 0.5 mm to :data:`FONT_SIZE`, at which a text is at most ``width`` mm wide.
+    """Return the largest font size, up to :data:`FONT_SIZE`, at which a text is at most ``width`` mm wide.
 
-    At the least size of 0.5 mm, a long text may be wider.
+    The font size is never below 0.5 mm. A long text may therefore be wider than ``width``.
     """
     return max(min(FONT_SIZE, width / (CHARACTER_WIDTH * len(text))), 0.5)
 

@@ -16,4 +16,5 @@ PAGE_WRITERS: dict[str, Callable[[Sequence[Page], float], list[bytes]]] = {
     ".pdf": lambda pages, dpi: [to_pdf(pages)],
     ".dxf": lambda pages, dpi: [to_dxf(page) for page in pages],
 }
-"""A function (pages, dpi) -> contents of the files, by suffix. PDF makes one file, other formats one file per page."""
+"""Writers by suffix. A writer takes (pages, dpi) and returns the contents of the files: one file for PDF, otherwise one
+file per page."""

@@ -10,12 +10,13 @@ from kpbench.printing.page import CUT, MARKS, Shape, Text
 from kpbench.printing.page_format import BLANK, PAGE_MARGIN, STRIP, PageFormat
 
 LINE = 0.1  # mm: width of every mark
-TICK_GAP, TICK = 1.0, 2.0  # mm: distance of a cut mark from a disc (half of it from a board), and length of the mark
+# mm: gap between a patch and a cut mark, and length of the mark. The gap between a board and a mark is TICK_GAP / 2.
+TICK_GAP, TICK = 1.0, 2.0
 CROSS_ARM = 2.5  # mm: length of each arm of a registration cross
 
 
 def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], list[Text]]:
-    """Return both rulers with their labels, the line of text on top, and the foot at the bottom right."""
+    """Return both rulers with their labels, the line of text at the top, and the foot at the bottom right."""
     (ruler_x, ruler_y), width, height = page_format.rulers_mm, page_format.width_mm, page_format.height_mm
     inner, below = BLANK + STRIP, height - BLANK - STRIP
     shapes = [
@@ -25,7 +26,7 @@ def frame(page_format: PageFormat, title: str, foot: str) -> tuple[list[Shape], 
     check = f"print at 100 %, check with a ruler: {ruler_x:g} mm"
     end, bottom = PAGE_MARGIN + ruler_x, height - BLANK - 0.6
     foot_size = font_size(foot, width - PAGE_MARGIN - end - 12)
-    if foot_size < SMALLEST_FOOT:  # a small page has no room beside the ruler
+    if foot_size < SMALLEST_FOOT:  # a small page has no room for the foot beside the ruler
         title, foot = f"{title}, {foot}", ""
     size = font_size(f"{title}    {check}", page_format.ink_size_mm[0])
     x, y = BLANK + STRIP / 2, height - PAGE_MARGIN - ruler_y
@@ -51,7 +52,7 @@ def _ruler(length: float) -> list[tuple[float, float]]:
 
 
 def disc_marks(x: float, y: float, radius: float) -> list[Shape]:
-    """Return the cut around a disc, and four cut marks that stay clear of the ink."""
+    """Return the circular cut around a patch, and four cut marks outside the circle."""
     near, far, half = radius + TICK_GAP, radius + TICK_GAP + TICK, LINE / 2
     boxes = [(near, -half, TICK, LINE), (-far, -half, TICK, LINE), (-half, near, LINE, TICK), (-half, -far, LINE, TICK)]
     ticks = [Shape(rectangle(x + dx, y + dy, w, h), MARKS) for dx, dy, w, h in boxes]

@@ -20,7 +20,7 @@ from kpbench.geometry.outline import Arc, Line, Region
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
 PRINT_MARK = "kpbench.print/1"
-"""Mark of a print, which lets :func:`kpbench.writing.write_file` replace the file."""
+"""Mark in the file of a print. :func:`kpbench.writing.write_file` may replace a print by a print."""
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,14 @@ from kpbench.printing.font import PDF_FONT
 from kpbench.printing.page import CUT, PRINT_MARK, Page, split_arcs, start_point
 
 PT_PER_MM = 72 / 25.4
-LONGEST_ARC_DEG = 22.5  # largest sweep of one Bézier curve; the curve is off the arc by less than 1e-7 radii
+LONGEST_ARC_DEG = 22.5  # largest sweep of one Bézier curve; the curve deviates from the arc by less than 1e-7 radii
 
 
 def to_pdf(pages: Sequence[Page]) -> bytes:
     """Return all pages as one PDF.
 
-    An arc becomes cubic Bézier curves of at most :data:`LONGEST_ARC_DEG` degrees. The control points of a curve lie on
-    the tangents at its ends, ``4/3 tan(sweep / 4)`` radii away from the ends.
+    An arc becomes cubic Bézier curves of at most :data:`LONGEST_ARC_DEG` degrees. The two inner control points of a
+    curve lie on the tangents at its ends, ``4/3 tan(sweep / 4)`` radii away from the ends.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""PNG in grey: each pixel is darkened by the exact area that ink covers. The file contains its resolution."""
+"""PNG in grey. Each pixel is darkened by the share of its area that ink covers. The file contains its resolution."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_PIXELS = 1_000_000_000
 
 
 def px_per_mm(dpi: float) -> float:
-    """Return the pixels per mm of a PNG, rounded to whole pixels per metre, as the file stores the resolution.
+    """Return the pixels per mm of a PNG, rounded to whole pixels per metre: PNG stores whole pixels per metre.
 
     Examples
     --------
@@ -31,7 +31,7 @@ def px_per_mm(dpi: float) -> float:
 def to_png(page: Page, dpi: float) -> bytes:
     """Return the page as 8-bit grey PNG.
 
-    The top-left corner of the page is the top-left corner of the first pixel, half a pixel from the centre of the
+    The page frame starts at the top-left corner of the first pixel. Pixel coordinates start at the centre of this
     pixel. A coordinate of x mm is therefore ``x * px_per_mm(dpi) - 0.5`` px.
 
     Parameters
@@ -89,7 +89,7 @@ def to_png(page: Page, dpi: float) -> bytes:
 
 
 def _letters(text: Text, scale: float) -> tuple[NDArray[np.float64], float, float]:
-    """Return the ink coverage of a text, and the x and y of its top-left pixel in px from its point on the baseline."""
+    """Return an image of a text's ink coverage, and the image's top-left pixel (x, y) relative to the text's point."""
     from PIL import Image, ImageDraw
 
     font = png_font(text.size * scale)

@@ -37,7 +37,7 @@ def print_patches(
     Parameters
     ----------
     patches : sequence of Patch, optional
-        The four shipped designs if left out.
+        Default: the four shipped designs.
     out : str or Path
         Folder; made if missing.
     diameter_mm : float
@@ -47,11 +47,11 @@ def print_patches(
     page : str or PageFormat
         Page format such as "a4" or "200x300mm". See :func:`kpbench.printing.parse_page_format`.
     formats : sequence of str
-        Some of "pdf", "svg", "png" and "dxf".
+        One or more of "pdf", "svg", "png" and "dxf".
     dpi : float
         Resolution of PNG.
     progress : callable
-        Called with the number of sheets written since the last call.
+        Called with the number of sheets written since its last call.
 
     Returns
     -------
@@ -155,7 +155,7 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
     folder : str or Path
         Made if missing.
     suffixes : sequence of str
-        Some of ".pdf", ".svg", ".png", ".dxf".
+        One or more of ".pdf", ".svg", ".png" and ".dxf".
     dpi : float
         Resolution of PNG.
 

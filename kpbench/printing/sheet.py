@@ -1,4 +1,4 @@
-"""Sheets: patches to cut out, or a board, laid out on pages with rulers, cut marks, labels and a sidecar.
+"""Sheets: patches to cut out, or a board, laid out on pages with rulers, cut marks and labels.
 
 Page frame: mm, x right, y down. The origin is the top-left corner of the page. A page is never scaled. A patch that is
 larger than the page is an error. A board that is larger than the page is an error unless the board is tiled.
@@ -29,7 +29,7 @@ LABEL_HEIGHT = 4.5  # mm: space for the label below a patch to cut out
 
 @dataclass(frozen=True)
 class Sheet:
-    """Pages of one print, with the sidecar that lists the positions of their keypoints.
+    """Pages of one print, with the sidecar that lists the positions of the keypoints.
 
     Attributes
     ----------
@@ -117,8 +117,8 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageF
 def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sheet:
     """Lay out a board in the middle of one page, or with ``tile`` on as few pages as possible.
 
-    The board is cut into tiles along straight seams that pass between patches. Registration crosses mark the corners of
-    every tile. Tiles that share a corner of the board frame carry a cross each at this corner.
+    If one page is too small, the board is cut into tiles along straight seams that pass between patches. Registration
+    crosses mark the corners of every tile. A corner that several tiles share gets a cross on each of these tiles.
 
     Parameters
     ----------
@@ -130,8 +130,8 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
     Raises
     ------
     DesignError
-        If the board does not fit the page and ``tile`` is false; the message names the largest diameter that fits. Or
-        if ``tile`` is true and no straight seam passes between the patches.
+        If the board does not fit the page and ``tile`` is false. The message names the largest diameter that fits. If
+        ``tile`` is true and no straight seam passes between the patches.
 
     Examples
     --------
@@ -203,7 +203,7 @@ def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], page_format: Pag
 
 
 def _on_page(tile: Tile, page_format: PageFormat, x: float, y: float) -> tuple[float, float]:
-    """Return the position in the layout of a point of the board. The tile lies in the middle of the page."""
+    """Return where a point of the board lies in the layout of a page. The tile lies in the middle of the page."""
     return x + (page_format.width_mm - tile.x0 - tile.x1) / 2, y + (page_format.height_mm - tile.y0 - tile.y1) / 2
 
 

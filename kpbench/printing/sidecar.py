@@ -22,7 +22,7 @@ from kpbench.writing import write_file
 
 BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
-LARGEST_ERROR = 0.1  # a ruler was measured wrongly if its length is off by a larger fraction
+LARGEST_ERROR = 0.1  # largest accepted deviation of a measured ruler, as a fraction of the ruler's nominal length
 
 
 def sidecar_head(
@@ -75,7 +75,8 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     Raises
     ------
     DesignError
-        If the folder holds no sidecar, a sidecar is incomplete, or a measured length is more than 10 % off.
+        If the folder holds no sidecar, a sidecar is incomplete, or a measured length differs from the ruler's
+        nominal length by more than 10 %.
 
     Examples
     --------
@@ -110,8 +111,8 @@ def correct_sidecar(
 ) -> dict[str, Any]:
     """Return the sidecar with lengths corrected to the real print. Positions on the page are not corrected.
 
-    If the scales in x and y differ, a printed disc is an ellipse. Its diameter in the sidecar becomes the geometric
-    mean of the ellipse's two axes.
+    If the scales in x and y differ, a printed disc is an ellipse. The diameter in the sidecar is then the geometric
+    mean of the two axes of the ellipse.
     """
     scale = [measured / nominal for measured, nominal in zip(measured_mm, sidecar["ruler_mm"], strict=True)]
     for axis, s, measured, nominal in zip("xy", scale, measured_mm, sidecar["ruler_mm"], strict=True):

@@ -10,12 +10,15 @@ from kpbench.printing.page import INK, MARKS, PRINT_MARK, Page, Text, round_to_n
 
 
 def _mm(*values: float) -> str:
-    """Return numbers rounded to 1 nm, without trailing zeros."""
+    """Return lengths in mm as text, rounded to 1 nm, without trailing zeros."""
     return " ".join(f"{round_to_nm(v):.6f}".rstrip("0").rstrip(".") for v in values)
 
 
 def _svg_path(region: Region) -> str:
-    """Return path data. Arcs are split at 90 degrees: rounding the ends of longer arcs would move their centres."""
+    """Return path data. Arcs are split into pieces of at most 90 degrees.
+
+    SVG stores only the ends and the radius of an arc. On a longer arc, rounding the ends would move the centre.
+    """
     data = []
     for contour in split_arcs(region, 90.0):
         data.append("M" + _mm(*start_point(contour[0])))

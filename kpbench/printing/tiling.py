@@ -1,4 +1,4 @@
-"""Tiles: pieces of a board that fit a page each, cut along straight seams that pass between patches."""
+"""Tiles: pieces of a board, cut along straight seams that pass between patches. Each tile fits a page."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SEAM_CLEARANCE = 1.0  # mm: least distance between a seam and a patch, enough fo
 
 @dataclass(frozen=True)
 class Tile:
-    """A tile: its row and column, both counted from 0, and its window in mm of the board frame."""
+    """A tile: its row and column, counted from 0, and its window from (x0, y0) to (x1, y1) in mm of the board frame."""
 
     row: int
     column: int
@@ -28,7 +28,7 @@ class Tile:
         return [(x, y) for y in (self.y0, self.y1) for x in (self.x0, self.x1)]
 
     def contains(self, x_mm: float, y_mm: float) -> bool:
-        """Return whether a point lies in the window. A point on a seam lies in the tile right of or below the seam."""
+        """Return whether a point lies in the window. A point on a seam lies in the tile to the right or below."""
         return self.x0 <= x_mm < self.x1 and self.y0 <= y_mm < self.y1
 
 
@@ -63,9 +63,9 @@ def cut_into_tiles(board: Board, width_mm: float, height_mm: float) -> list[Tile
 def _seams(spans: Sequence[tuple[float, float]], side: float, longest: float) -> list[float] | None:
     """Return the ends of the board and the seams along one axis, in ascending order.
 
-    The pieces between are as few as possible and at most ``longest`` mm long. ``spans`` holds the ends of every patch
-    along the axis. A seam lies in the middle of its gap between patches, unless a piece would become too long. Return
-    None if no seam passes between the patches.
+    The seams divide the axis into as few pieces as possible, each at most ``longest`` mm long. ``spans`` holds the
+    least and greatest coordinate of every patch along the axis. A seam lies in the middle of its gap between patches,
+    unless a piece would become too long. Return None if no seam passes between the patches.
     """
     blocked = sorted(((low - SEAM_CLEARANCE, high + SEAM_CLEARANCE) for low, high in spans), key=lambda b: -b[1])
     cuts = [-side / 2]
