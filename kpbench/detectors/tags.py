@@ -18,7 +18,7 @@ from kpbench.types import Detections, UInt8
 APRILTAG_DECIMATION = 1.5
 """Factor by which the AprilTag library shrinks the image. The library detects fewer tags with a factor of 1 or 2."""
 LEAST_APRILTAG_SIDE_PX = 8
-"""Least shorter side of an image, px. A smaller image gets no detections, because the library crashes on tiny images."""
+"""Least shorter side of an image, px. A smaller image has no detections, as the library crashes on tiny images."""
 
 
 class ArucoDetector:
