@@ -127,11 +127,11 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
 
 @dataclass(frozen=True)
 class _State:
-    """One patch during the fit, in px of its level.
+    """One patch during the fit, in px of the pyramid level.
 
     ``window`` is the map that the fit started from. This map, centred at ``xy``, decides which pixels count: the pixels
-    inside the patch's extent without a margin at the rim. ``bend`` holds the first two entries of the last row of the homography.
-    ``moved`` is the size of the last step, in short semi-axes.
+    inside the patch's extent, except for a margin at the rim. ``bend`` holds the first two entries of the last row of
+    the homography. ``moved`` is the size of the last step, in short semi-axes.
     """
 
     xy: Float

@@ -29,7 +29,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 CORE_RADIUS_PX = 3.0
-"""Short semi-axis of the core's circle, px of the level that is searched. The smallest patches measure 5 px."""
+"""Short semi-axis of the core's circle, px of the searched level. The circle fits into patches of 5 px radius."""
 SPOKES = 40
 """Samples on each circle of :func:`estimate_size`."""
 RING_RADII = 0.7 * 1.12 ** np.arange(34)
