@@ -65,8 +65,8 @@ def point_bound(
     """Return the Cramér-Rao bound of the image point of the cells' origin, at :data:`NOISE` and :data:`CONTRAST`.
 
     The 8 unknowns are the point (2), the affine deformation (4) and both inks (2). Derivatives are central differences
-    of exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided by
-    the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
+    of exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided
+    by the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
     1993, eq. 3.31). The cells are surrounded by a known mid-grey.
 
     Parameters

@@ -4,7 +4,7 @@ A design is kept if
 
 * its centre is a crossing of straight edges,
 * its smallest region holds a circle of 2 px diameter at a disc radius of 4 px,
-* its basin is at least 0.10; the basin of a corner is 0.041,
+* its basin is at least 0.10 (a single corner has a basin of 0.041),
 * its bound without the rim is at most 0.05 px at 5 px radius,
 * at most one in 500 places of natural images looks like the design.
 

@@ -40,7 +40,7 @@ PROGRAM_PREFIX = "program:"
 
 
 class Detector(Protocol):
-    """An object that ``MODULE:ATTR`` may name. A plain function from an image to detections is a detector too.
+    """An object with a method ``detect``. A plain function from an image to detections is a detector too.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
-        Designs that ``template`` looks for. None: the four shipped designs.
+        Designs that the detector ``template`` looks for. None: the four shipped designs.
 
     Raises
     ------

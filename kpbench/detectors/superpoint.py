@@ -115,7 +115,7 @@ def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
     side = 2 * decoding.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
-    # a window whose sum reaches the threshold has a maximum of at least its mean; 0.5 allows for the smoothing
+    # if the sum of a window reaches the threshold, the maximum is at least threshold / width²; 0.5 allows for smoothing
     found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])

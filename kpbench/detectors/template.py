@@ -1,10 +1,10 @@
-"""A classical detector without training, for any design with straight edges that cross at its centre.
+"""A classical detector, which needs no training, for any design with straight edges that cross at its centre.
 
 1. Crossings (:func:`find_crossings`). A straight edge through a point stays straight under any perspective. Gradients
-   on this edge are perpendicular to the edge. A pixel is a crossing if the gradients around the pixel are perpendicular
-   to the lines towards the pixel, and have more than one direction. This is a form of the operator of Förstner and
-   Gülch, *A fast operator for detection and precise location of distinct points, corners and centres of circular
-   features*, 1987. The operator needs no templates. A few hundred places remain.
+   on this edge are perpendicular to the edge. A pixel is a crossing if each gradient around the pixel is perpendicular
+   to the line from its place to the pixel, and the gradients have more than one direction. This is a form of the
+   operator of Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and
+   centres of circular features*, 1987. The operator needs no templates. A few hundred places remain.
 2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
    at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
 3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels, from the remaining poses.
@@ -29,7 +29,7 @@ from kpbench.types import Detections, Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
 VERSION = "1"
-"""Version of the method. Raise it by one when detections change."""
+"""Version of the method. Raise the version by one when detections change."""
 
 
 @dataclass(frozen=True)
@@ -96,8 +96,8 @@ class ScoreWeights:
     """Weights of the score: a logistic regression on five measures of a candidate.
 
     Source: fitted to candidates in synthetic images over training photographs, under every deterioration of the paper.
-    A candidate was right if it lay within a tenth of the radius of a true centre and had the right design. A candidate
-    was wrong if it lay on no patch. All other candidates were left out.
+    A candidate with the right design within a tenth of the radius from a true centre was right. A candidate on no patch
+    was wrong. All other candidates were left out.
 
     Attributes
     ----------

@@ -71,7 +71,7 @@ LEAST_FIT_LOG_ODDS = -3.5
 LARGEST_FIT_MOVE = 0.1
 """If a fit moves the centre further than this, in short semi-axes, the earlier pose is kept: it is right more often."""
 USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. The judges' log odds hold for such an image."""
+"""Number of candidates in a typical training image of 640x480 px. The judges' log odds apply to such images."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
@@ -82,7 +82,7 @@ PLACES_PER_BLOCK = 2**11
 
 @dataclass(frozen=True)
 class VerifiedCandidates:
-    """The n candidates that were fitted and are no specks, each with its likeliest design.
+    """The n candidates that were fitted and are large enough, each with its likeliest design.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # more candidates than usual do not mean more patches, so each candidate is then less likely a patch
+    # more candidates than usual do not mean more patches, so each candidate is less likely to be a patch
     log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
