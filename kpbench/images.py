@@ -22,15 +22,15 @@ from kpbench.types import UInt8
 from kpbench.writing import move_file, require_writable, write_file
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
-DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # of a single image into which detections are drawn
-DEFAULT_FPS = 25.0  # frames per second, of a video or camera that states no frame rate
+DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of an image file into which detections are drawn
+DEFAULT_FPS = 25.0  # frames per second of a video or camera that reports no frame rate
 PNG_HEAD_BYTES = 33
 """Length of the signature and of the first chunk (IHDR) of a PNG file."""
 _SOFTWARE = b"tEXtSoftware\0kpbench.picture/1"
 PNG_MARK = struct.pack(">I", len(_SOFTWARE) - 4) + _SOFTWARE + struct.pack(">I", zlib.crc32(_SOFTWARE))
-"""Chunk of a PNG file; it lets :func:`kpbench.writing.write_file` replace the file."""
+"""PNG chunk that marks a file as written by kpbench. :func:`kpbench.writing.write_file` may replace such a file."""
 JPEG_MARK = b"\xff\xfe\0\x13kpbench.picture/1"
-"""The same as a comment of a JPEG file."""
+"""JPEG comment that marks a file in the same way."""
 VIDEO_MARK = b"kpbench.video/1 "
 
 
@@ -188,7 +188,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
         size = (image.shape[1], image.shape[0])
         sizes.add(size)
         if len(sizes) > 1:  # OpenCV would silently drop the frame
-            raise DataError(f"{target}: {name} is of another size than those before, expected a folder to draw into")
+            raise DataError(f"{target}: {name} differs in size from the images before, expected a folder to draw into")
         if not video:
             video.append(cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size))
             if not video[0].isOpened():
@@ -213,7 +213,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
 
 
 def _video_mark(suffix: str) -> bytes:
-    """Return an element that players skip: Void of Matroska, a JUNK chunk of AVI, a free box of MP4."""
+    """Return kpbench's mark in an element that players skip: Matroska's Void, AVI's JUNK chunk, or MP4's free box."""
     if suffix in (".mkv", ".webm"):
         return b"\xec" + bytes([0x80 | len(VIDEO_MARK)]) + VIDEO_MARK
     if suffix == ".avi":

@@ -35,7 +35,7 @@ Progress = Callable[[int], None]
 PROGRESS_INTERVAL_S = 0.2
 """Longest time between two reports of progress, s, so that a progress bar moves smoothly."""
 JOBS_AHEAD = 4
-"""Number of jobs per worker process that :func:`run_in_order` submits before their results are asked for."""
+"""Number of jobs per worker process that :func:`run_in_order` submits ahead of the results that are asked for."""
 WORKER_DIED = "a worker process died (out of memory?)"
 
 
@@ -56,8 +56,8 @@ def run_jobs(
     Parameters
     ----------
     work : callable
-        Called as ``work(job, progress)``. ``work`` must be picklable. ``work`` reports its own finished images to its
-        argument ``progress``.
+        Called as ``work(job, progress)``. ``work`` must be picklable. ``work`` calls its argument ``progress`` with the
+        number of images finished since the last call.
     jobs : sequence
     workers : int or None
         Number of worker processes; None for one per core. With 1, the jobs run in this process, in order.
@@ -217,7 +217,7 @@ def use_one_thread() -> None:
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Make BLAS use one thread within a ``with`` block; more threads would wait busily and slow other work down."""
+    """Make BLAS use one thread within a ``with`` block; idle BLAS threads spin and slow other work down."""
     limit: AbstractContextManager[Any] = _threadpool_controller().limit(limits=1, user_api="blas")
     return limit
 

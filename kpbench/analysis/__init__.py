@@ -1,4 +1,4 @@
-"""Measures of designs: localisation, identity and look-alikes in natural images; the search for the best designs.
+"""Measures of designs (localisation, identity, look-alikes in natural images), and the search for the best designs.
 
 Examples
 --------

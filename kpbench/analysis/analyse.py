@@ -65,14 +65,14 @@ def analyse_patches(
         Whether to repeat the search that chose the shipped designs, and to measure the best set. ``patches`` must then
         be left out.
     backgrounds : str or Path, optional
-        Folder of photographs. The places in the photographs that look like a design are counted. Procedural
-        backgrounds if left out.
+        Folder of photographs in which the places that look like a design are counted. If left out, places in procedural
+        backgrounds are counted.
     json_file : str or Path, optional
         File for all measures.
     figure_file : str or Path, optional
         .svg, .png or .pdf file for one page with the designs and their measures.
     progress : callable
-        Called with the number of steps finished since the last call, :func:`count_steps` in all.
+        Called with the number of steps finished since the last call. The numbers add up to :func:`count_steps`.
 
     Returns
     -------
@@ -81,7 +81,7 @@ def analyse_patches(
     Raises
     ------
     DesignError
-        If the figure's name does not end in .svg, .png or .pdf, or ``patches`` and ``search_family`` are both given.
+        If the figure's name does not end in .svg, .png or .pdf, or ``patches`` are given and ``search_family`` is True.
     DataError
         If the folder holds no photograph, or a file cannot be written.
 

@@ -2,7 +2,7 @@
 
 A design is a polar chequer. Its image is therefore *linear* in its inks. Every cell is rendered once per attitude, with
 exact area coverage. The image of a design, its derivatives and its correlations with other designs are then products of
-matrices with the vector of its inks. A whole family of designs can be measured in this way.
+matrices with the vector of its inks. This makes the measures of a whole family of designs affordable.
 
 Conventions
 -----------
@@ -33,7 +33,7 @@ TILT_DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # directions in the image along 
 TURNS = 24  # number of rotations in the plane that are compared, 15 degrees apart
 WINDOW_PX = 5.0  # radius of the window
 BLUR = 0.2  # standard deviation, as a fraction of the window's radius
-HALF_SIDE_PX = int(WINDOW_PX) + 1  # half the side of the square around the window, without the middle px
+HALF_SIDE_PX = int(WINDOW_PX) + 1  # px on each side of the middle px of the square around the window
 BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # margin around the square, for the blur
 
 
@@ -104,12 +104,12 @@ class PolarGrid:
     def cell_polygons(self, tolerance: float, reach: float = 0.0) -> list[Float]:
         """Return every cell as a polygon of the patch frame.
 
-        Neighbours share the vertices of their common border, so cells of one ink add up without a seam.
+        Neighbouring cells share the vertices of their common border, so cells of one ink add up without a seam.
 
         Parameters
         ----------
         tolerance : float
-            Largest distance between an arc and its chords, in disc radii, see :func:`kpbench.geometry.flatten`.
+            As for :func:`kpbench.geometry.flatten`, in disc radii.
         reach : float
             Least radius to which the outermost ring extends, in disc radii.
         """
@@ -260,7 +260,7 @@ def window_weights(attitude: Float) -> Float32:
 
 
 def mean_free_images(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
-    """Return designs' images minus their weighted means, shape (n, pixels), and weighted standard deviations, (n,)."""
+    """Return images (n, pixels) of designs minus their weighted means, and weighted standard deviations (n,)."""
     image = inks @ cells
     image -= (image @ weight)[:, None]
     spread: Float32 = np.sqrt(np.maximum((image * image) @ weight, np.float32(1e-9)))

@@ -42,7 +42,7 @@ STROKES = _strokes()
 
 
 def paint_semicircle(codes: Codes, stroke: int) -> Codes:
-    """Return the designs with one more semi-circle; ``stroke`` is its index in :data:`STROKES`."""
+    """Return the designs with one more semi-circle; ``stroke`` is the index of the semi-circle in :data:`STROKES`."""
     semicircle, bits = STROKES[stroke]
     if semicircle.ink == "invert":
         return codes ^ bits
@@ -82,8 +82,9 @@ class Family:
     Attributes
     ----------
     codes : ndarray of shape (N,), uint32
+        Code of each design.
     parents : ndarray of shape (N,), int64
-        Index of the design before the last semi-circle; -1 for a bare disc.
+        Index of the design without the last semi-circle; -1 for a bare disc.
     strokes : ndarray of shape (N,), int64
         Index of the last semi-circle in :data:`STROKES`; -1 for a bare disc.
     """

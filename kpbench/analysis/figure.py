@@ -1,4 +1,4 @@
-"""Figure of an analysis: a page with each design, its image in a camera, its measures and its look-alikes."""
+"""Figure of an analysis: a page with each design, its image in a camera, its measures and its distances to others."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from kpbench.printing.page import Page, Shape, Text
 FIGURE_SUFFIXES = (".svg", ".png", ".pdf")
 """Suffixes of files that a figure can be written to."""
 PAGE_WIDTH = 210.0  # all lengths in mm
-ROW, TOP, LEFT = 42.0, 14.0, 6.0  # height of a row, beginning of the first row, beginning of the first column
+ROW, TOP, LEFT = 42.0, 14.0, 6.0  # height of a row, top of the first row, left border of the first column
 FONT = 2.6
 ICON = 13.0  # radius of the outline of a design
 DOT = 1.9  # side of the square for a black pixel of the image
-BAR, BAR_STEP = 36.0, 4.6  # length of a full bar, and distance between the beginnings of two bars
-BARS_X, PAIRS_X = 82.0, 146.0  # beginning of the column of measures, and of the column of other designs
-FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # values for which a bar has its full length
+BAR, BAR_STEP = 36.0, 4.6  # length of a full bar, and distance from one bar to the bar below
+BARS_X, PAIRS_X = 82.0, 146.0  # left borders of the column of measures and of the column of other designs
+FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # a bar of this value, or of a larger value, has its full length
 MOST_OTHERS = 6  # largest number of other designs in a row
 
 

@@ -1,8 +1,8 @@
 """Identity: how similar a design looks to other designs, to itself after a rotation, and to its mirror image.
 
-A distance is the root mean square of a difference of images, in units of the ink contrast. A distance of 0.1 at a
-contrast of 180 grey levels is a difference of 18 grey levels per pixel. Noise must reach this difference before one
-design looks like another.
+A distance is the root mean square of a difference of images, in units of the ink contrast. At a contrast of 180 grey
+levels, a distance of 0.1 means a root mean square of 18 grey levels. Noise must reach this difference before one design
+looks like another.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ def correlation_and_distance(
 ) -> tuple[Float32, Float32]:
     """Return how similar each pair of designs can look.
 
-    The first design is blurred and seen in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`. The second
-    design, or its mirror image, is seen in the attitude that matches best, with the best positive gain and offset. Each
-    comparison is made for every fraction :data:`PARTS_OF_IDENTITY` of the patch in the window. The most similar case
-    counts. Each pair is compared in both orders, so both results are symmetric.
+    Both designs are blurred. The first design is seen in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`.
+    The second design, or its mirror image, is seen in the attitude that matches best, with the best positive gain and
+    offset. Each comparison is made with every fraction of the patch's radius in :data:`PARTS_OF_IDENTITY` inside the
+    window. The most similar case counts. Each pair is compared in both orders, so both results are symmetric.
 
     Parameters
     ----------
     grid : PolarGrid
     inks : ndarray of shape (n, cells), float32
     progress : callable
-        Called with the number of steps finished since the last call, :data:`IDENTITY_STEPS` in all.
+        Called with the number of steps finished since the last call. The numbers add up to :data:`IDENTITY_STEPS`.
 
     Returns
     -------
     correlation : ndarray of shape (n, n), float32
-        Largest normalised correlation.
+        Largest normalised correlation of each pair.
     distance : ndarray of shape (n, n), float32
-        Root mean square of the remaining difference, in units of the ink contrast.
+        Smallest distance of each pair.
 
     Examples
     --------

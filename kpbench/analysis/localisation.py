@@ -24,7 +24,7 @@ from kpbench.types import Float, Float32
 NOISE = 10.0  # grey levels, standard deviation of the noise in a pixel
 CONTRAST = 180.0  # grey levels, white minus black
 PARTS_OF_BASIN = (1.0, 1 / 2, 1 / 3)  # fractions of the patch's radius that the window shows
-SHIFT = 0.25  # of a design against itself, as a fraction of the window's radius
+SHIFT = 0.25  # shift of a design against its copy, as a fraction of the window's radius
 SHIFT_DIRECTIONS = 8
 
 
@@ -62,11 +62,11 @@ class Bound:
 def point_bound(
     cells: Sequence[Float], inks: Float32, attitude: Float, blur_px: float = 0.0, rim: bool = True
 ) -> tuple[Float, Float]:
-    """Return the Cramér-Rao bound of the point at the origin of the cells, at :data:`NOISE` and :data:`CONTRAST`.
+    """Return the Cramér-Rao bound of the image point of the cells' origin, at :data:`NOISE` and :data:`CONTRAST`.
 
-    There are 8 unknowns: the point, the 2x2 affine deformation and both inks. Derivatives are central differences of
-    exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided by
-    the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
+    The 8 unknowns are the point (2), the affine deformation (4) and both inks (2). Derivatives are central differences
+    of exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided
+    by the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
     1993, eq. 3.31). The cells are surrounded by a known mid-grey.
 
     Parameters
@@ -85,8 +85,8 @@ def point_bound(
     Returns
     -------
     worst_px, rms_px : ndarray of shape (n,)
-        Standard deviation in the worst direction, and root mean square of the standard deviations along x and y. Both
-        are infinite if the image does not determine the point.
+        Standard deviation of the point in the worst direction, and root mean square of its standard deviations along x
+        and y. Both are infinite if the image does not determine the point.
 
     Examples
     --------
@@ -123,7 +123,7 @@ def point_bound(
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
     F = J @ J.transpose(0, 2, 1)
     nuisance = np.linalg.pinv(F[:, 2:, 2:], rcond=1e-7, hermitian=True)
-    # Schur complement: the information on the point if the other six unknowns are estimated too
+    # Schur complement: the information on the point when the other six unknowns are estimated too
     centre = F[:, :2, :2] - F[:, :2, 2:] @ nuisance @ F[:, 2:, :2]
     information = np.linalg.eigvalsh(centre)
     known = information > 1e-5 * F[:, :2, :2].trace(axis1=1, axis2=2)[:, None]
@@ -176,8 +176,8 @@ def basin(grid: PolarGrid, inks: Float32) -> Float:
     """Return how much each design differs from itself at a small shift.
 
     A blurred patch is compared with itself, shifted by :data:`SHIFT` of the window's radius. The comparison is made for
-    eight directions of the shift, for every attitude of the shifted patch, and for every fraction
-    :data:`PARTS_OF_BASIN` of the patch in the window. The difference is a root mean square after the best gain and
+    eight directions of the shift, for every attitude of the shifted patch, and with every fraction of the patch's
+    radius in :data:`PARTS_OF_BASIN` inside the window. The difference is a root mean square after the best gain and
     offset, in units of the ink contrast. The smallest difference is returned.
 
     Parameters
@@ -218,8 +218,8 @@ def tilt_bias(patch: Patch, radius_px: float = 45.0, tilt_deg: float = 60.0) -> 
     """Return the distance in px between the keypoint and the centre of the disc's ellipse, in a tilted view.
 
     The ellipse's centre is not the image of the disc's centre. If straight edges cross at the keypoint, they determine
-    the keypoint, and 0 is returned. Otherwise arcs alone determine the keypoint in at least one direction. The camera
-    is the paper's (1624x1240, focal length 889 px).
+    the keypoint, and 0 is returned. Otherwise arcs alone determine the keypoint in at least one direction. The view
+    is from the paper's camera (1624x1240 px, focal length 889 px).
     """
     if patch.centre_is_crossing:
         return 0.0

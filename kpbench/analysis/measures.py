@@ -23,7 +23,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, UInt8
 
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
-"""Radii of discs at which the bound is computed."""
+"""Radii of the disc for which bounds are computed, px."""
 MEASURE_STEPS = len(SIZES_PX) * len(TILTS_DEG) * 2 + IDENTITY_STEPS
 """Number of steps that :func:`measure_designs` reports."""
 
@@ -47,19 +47,19 @@ class DesignMeasures:
         Distance between the keypoint and the centre of the disc's ellipse at a tilt of 60 degrees. 0 if straight edges
         determine the keypoint.
     black_fraction : float
-        Share of the design's area that is black.
+        Black share of the design's area.
     pixels_needed : float
         Radius of the disc in px at which the smallest region holds a circle of 2 px diameter.
     bounds : tuple of Bound
-        One per size, tilt and blur.
+        One bound for each combination of size, tilt and blur.
     bound_without_rim_px : float
-        Bound in the worst direction at 5 px radius on an unknown background. Infinite if the inside of the patch alone
-        does not determine the centre.
+        Bound in the worst direction, for a frontal view at 5 px radius on an unknown background. Infinite if the inside
+        of the patch alone does not determine the centre.
     basin : float
         Difference between the design and its shifted copy, in ink contrasts, see :func:`kpbench.analysis.basin`.
     natural_response, natural_response_blurred : tuple of float
-        Shares of places in images whose correlation with the design is above 0.8, and above 0.9. The second
-        tuple is for blurred designs and images.
+        Share of the places in images with a correlation above 0.8 with the design, and share with a correlation above
+        0.9. The second tuple is for blurred designs and images.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class DesignMeasures:
         return sorted({bound.radius_px for bound in self.bounds})
 
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
-        """Return the bound of a size, tilt and blur that is in ``bounds``."""
+        """Return the element of ``bounds`` with this size, tilt and blur."""
         wanted = (radius_px, tilt_deg, blur)
         return next(b for b in self.bounds if (b.radius_px, b.tilt_deg, b.blur) == wanted)
 
@@ -164,7 +164,7 @@ def measure_designs(
     windows : ndarray of shape (N, side, side), uint8
         From :func:`kpbench.analysis.background_windows`.
     progress : callable
-        Called with the number of steps finished since the last call, :data:`MEASURE_STEPS` in all.
+        Called with the number of steps finished since the last call. The numbers add up to :data:`MEASURE_STEPS`.
     """
     grid = PolarGrid.of(patches)
     inks = grid.inks(patches)
@@ -212,7 +212,7 @@ def pixels_needed(grid: PolarGrid, inks: Float32, samples: int = 128) -> Float:
     grid : PolarGrid
     inks : ndarray of shape (n, cells), float32
     samples : int
-        Number of samples per disc diameter on which regions are found.
+        Regions are found on a square grid with this many samples along the disc's diameter.
 
     Returns
     -------

@@ -91,7 +91,7 @@ def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count
     Returns
     -------
     ndarray of shape (count, side, side), uint8
-        Squares around the windows, with a margin for a blur. There are fewer squares if the images run out.
+        Squares around the windows, with a margin for a blur. If the images run out, fewer squares are returned.
 
     Examples
     --------
@@ -126,13 +126,13 @@ def natural_response(grid: PolarGrid, inks: Float32, windows: UInt8, blur: float
     windows : ndarray of shape (N, side, side), uint8
         From :func:`sample_windows`.
     blur : float
-        Blur of designs and windows, as a fraction of the window's radius.
+        Standard deviation of the blur of designs and windows, as a fraction of the window's radius.
 
     Returns
     -------
     ndarray of shape (n, 2), float64
-        Shares of the windows with a correlation above 0.8, and above 0.9. A window with a standard deviation under 8
-        grey levels never looks like a design.
+        Share of the windows with a correlation above 0.8, and share with a correlation above 0.9. A window with a
+        standard deviation under 8 grey levels never looks like a design.
 
     Examples
     --------

@@ -4,7 +4,7 @@ A design is kept if
 
 * its centre is a crossing of straight edges,
 * its smallest region holds a circle of 2 px diameter at a disc radius of 4 px,
-* its basin is at least 0.10; the basin of a corner is 0.041,
+* its basin is at least 0.10 (a single corner has a basin of 0.041),
 * its bound without the rim is at most 0.05 px at 5 px radius,
 * at most one in 500 places of natural images looks like the design.
 
@@ -39,7 +39,7 @@ SEARCH_STEPS = 6 + IDENTITY_STEPS
 
 
 def best_sets(distance: Float32, size: int, count: int) -> list[tuple[int, ...]]:
-    """Return the sets whose closest two members are farthest apart, best first; the next closest pairs decide ties.
+    """Return the sets whose closest two members are farthest apart, best first. The next closest pairs decide ties.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ def best_sets(distance: Float32, size: int, count: int) -> list[tuple[int, ...]]
     """
     n = len(distance)
     pairs = np.unique(distance[np.triu_indices(n, 1)])
-    low, high = 0, len(pairs)  # enough sets have all distances >= pairs[low], or low is 0
+    low, high = 0, len(pairs)  # at least `count` sets have all distances >= pairs[low], or low is 0
     while high - low > 1:
         middle = (low + high) // 2
         found = _cliques(distance >= pairs[middle], size)
@@ -82,7 +82,7 @@ def pair_distances(distance: Float32, members: tuple[int, ...]) -> Float32:
 
 
 def _cliques(apart: NDArray[np.bool_], size: int) -> Iterator[tuple[int, ...]]:
-    """Yield every set of ``size`` indices whose pairs are all ``apart``; indices ascend."""
+    """Yield every set of ``size`` indices whose pairs are all ``apart``, each set in ascending order."""
 
     def grow(members: tuple[int, ...], candidates: NDArray[np.int64]) -> Iterator[tuple[int, ...]]:
         if len(members) == size:
@@ -159,7 +159,7 @@ def search_designs(
     count : int
         Largest number of sets that are returned.
     progress : callable
-        Called with the number of steps finished since the last call, :data:`SEARCH_STEPS` in all.
+        Called with the number of steps finished since the last call. The numbers add up to :data:`SEARCH_STEPS`.
 
     Examples
     --------

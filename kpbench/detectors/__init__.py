@@ -1,7 +1,7 @@
-"""Detectors: the interface, the detectors that ship, and running them over datasets and images.
+"""Detectors: the interface, the shipped detectors, and functions that run detectors over datasets and images.
 
 A detector is a function of an image, or an object with a method ``detect``; both return
-:class:`kpbench.Detections`. :func:`load_detector` loads one by name.
+:class:`kpbench.Detections`. :func:`load_detector` loads a detector by name.
 """
 
 import lazy_loader

@@ -1,7 +1,7 @@
-"""OpenCV's ORB and SIFT: points without identities, which show what a general detector finds.
+"""OpenCV's ORB and SIFT, general detectors for comparison. Their points have no identities.
 
-Neither detector knows what a patch is, so most of their points are false alarms. Settings are OpenCV's defaults. Both
-detectors are limited to 500 points per image.
+Neither detector knows the patches, so most points are false alarms. ORB runs with OpenCV's defaults, which allow 500
+points per image. SIFT runs with OpenCV's defaults and the same limit.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from kpbench.images import to_grey
 from kpbench.types import Detections, UInt8
 
 LEAST_IMAGE_PX = 8
-"""Shorter side of the smallest image that OpenCV's pyramids can take, px. A smaller image has no detections."""
+"""OpenCV's pyramids need a shorter side of at least this many px. A smaller image has no detections."""
 
 
 def orb(image: UInt8) -> Detections:

@@ -18,7 +18,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""Distance, in short semi-axes. Of two hypotheses of one design with nearer centres, the likelier is kept."""
+"""If two hypotheses of one design have centres nearer than this, in short semi-axes, only the likelier is kept."""
 
 
 class Evidence(IntEnum):
@@ -37,19 +37,19 @@ class Evidence(IntEnum):
     ELLIPSE = 3
     """Log odds that the place lies on a patch, by the ellipse network."""
     NCC = 4
-    """-log(1.01 - correlation of the whole design)."""
+    """-log(1.01 - correlation of the whole design with the image)."""
     SHIFT = 5
     """Log of the distance of the centre from the network's place."""
     CONTRAST = 6
-    """Log of half the contrast, divided by the image's range of grey levels."""
+    """Log of the ratio of half the contrast to the image's range of grey levels."""
     CONTRAST_TO_NOISE = 7
-    """Log of half the contrast, divided by the image's noise."""
+    """Log of the ratio of half the contrast to the image's noise."""
     RADIUS = 8
     """Log of the short semi-axis, px."""
     FIT_NCC = 9
-    """-log(1.01 - correlation of the fit)."""
+    """-log(1.01 - correlation of the fitted design with the image)."""
     FIT_UNEXPLAINED = 10
-    """Log of the part of the fit's residuals that the image's noise does not explain, in contrasts."""
+    """Log of the ratio of the fit's residuals beyond the image's noise to the contrast."""
     FIT_BLUR = 11
     """Standard deviation of the blur, in short semi-axes."""
     FIT_SHIFT = 12
@@ -57,13 +57,13 @@ class Evidence(IntEnum):
     FIT_MOVE = 13
     """Log of the distance of the fitted centre from the centre before the fit."""
     FIT_CONTRAST = 14
-    """Log of the fitted contrast, divided by the image's range of grey levels."""
+    """Log of the ratio of the fitted contrast to the image's range of grey levels."""
     FIT_CONTRAST_TO_NOISE = 15
-    """Log of the fitted contrast, divided by the image's noise."""
+    """Log of the ratio of the fitted contrast to the image's noise."""
     FIT_RADIUS = 16
     """Log of the fitted short semi-axis, px."""
     FIRST_JUDGE = 17
-    """Log odds by the first judge."""
+    """Log odds that the first judge gave."""
     OTHER_PATCHES = 18
     """Log of 1 + the expected number of right hypotheses elsewhere in the image."""
     OTHER_ERRORS = 19
@@ -89,7 +89,7 @@ class Hypotheses:
     xy, A : ndarray of shape (n, 2) and (n, 2, 2)
         Pose: the centre, px, and the map from the patch frame to px.
     view : ndarray of shape (n, VIEW_PX²)
-        From :func:`kpbench.fitting.views.rectify`; nan outside the image.
+        The image in the frame of the patch, from :func:`kpbench.fitting.views.rectify`; nan outside the image.
     blur_px : ndarray of shape (n,)
         Standard deviation of the fitted blur, px; 0 before the fit.
     evidence : ndarray of shape (n, columns)
@@ -126,7 +126,7 @@ def select_likeliest(place: Int, log_odds: Float) -> Int:
 def select_distinct(hypotheses: Hypotheses, log_odds: Float, least_log_odds: float) -> Int:
     """Return the indices of distinct hypotheses with at least ``least_log_odds``.
 
-    Of near hypotheses of one design, only the likeliest is kept, see :data:`MERGE_DISTANCE`.
+    Of hypotheses of one design with centres nearer than :data:`MERGE_DISTANCE`, only the likeliest is kept.
     """
     likely = np.flatnonzero(log_odds >= least_log_odds)
     kept = [np.zeros(0, np.int64)]
@@ -155,5 +155,5 @@ def judge_inputs(hypotheses: Hypotheses, patches: Sequence[Patch]) -> dict[str, 
 
 
 def clipped_semi_axis(A: Float) -> Float:
-    """Return the short semi-axes (n,) of maps (n, 2, 2), px, at least 0.5."""
+    """Return the short semi-axes (n,) of maps (n, 2, 2), px. Semi-axes below 0.5 px are raised to 0.5 px."""
     return np.maximum(short_semi_axis(A), 0.5)

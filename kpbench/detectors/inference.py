@@ -65,13 +65,13 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     model : bytes
         Content of an ONNX file.
     threads : int
-        0 means as many as OpenCV may use, which is one in worker processes.
+        Number of threads. 0 means as many as OpenCV may use; in a worker process OpenCV may use one thread.
 
     Returns
     -------
     session : InferenceSession
     metadata : str
-        Text that kpbench wrote into the file, or "".
+        Text that kpbench wrote into the file, "" in a file without such text.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cv2.getNumThreads()
     options.log_severity_level = 3
-    # threads that wait busily would take time from other processes
+    # by default, idle threads spin, which takes processor time from other processes
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     if runtime == "cuda" and not runs_on_gpu():
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")

@@ -1,7 +1,7 @@
-"""The interface of a detector, the detectors that ship, and how to load a detector by name.
+"""The interface of a detector, the shipped detectors, and how to load a detector by name.
 
-A detector takes an image and returns :class:`~kpbench.types.Detections`. It is a function, or an object with a method
-``detect``. There is nothing to inherit from.
+A detector takes an image and returns :class:`~kpbench.types.Detections`. A detector is a function, or an object with a
+method ``detect``. No base class is needed.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ DETECTORS = {
 }
 """Name of each shipped detector → its definition, as ``MODULE:ATTR``."""
 PROGRAM_PREFIX = "program:"
-"""A name that begins with this prefix is a command line, see :func:`kpbench.detectors.program.run_program`."""
+"""The part of a name after this prefix is a command line, see :func:`kpbench.detectors.program.run_program`."""
 
 
 class Detector(Protocol):
-    """An object that ``MODULE:ATTR`` may name. A plain function from an image to detections is a detector too.
+    """An object with a method ``detect``. A plain function from an image to detections is a detector too.
 
     Examples
     --------
@@ -81,7 +81,8 @@ class LoadedDetector:
     Raises
     ------
     DataError
-        On a call, if the detector returns no :class:`Detections`, a number that is not finite, or a negative patch ID.
+        On a call, if the result is not :class:`Detections`, or has a negative patch ID or a coordinate or score that is
+        not finite.
 
     Examples
     --------
@@ -129,19 +130,18 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     ----------
     name : str
         One of :data:`DETECTORS`; weights ``FILE.onnx`` written by ``kpbench export-model``; ``MODULE:ATTR``; or
-        ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, an object that can be
-        called, or a class that makes such an object when it is called without arguments. Modules in the current folder
-        are found.
+        ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, a callable object, or
+        a class whose constructor needs no arguments and makes such an object. MODULE may lie in the current folder.
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
-        Designs that ``template`` looks for. None: the four shipped designs.
+        Designs that the detector ``template`` looks for. None: the four shipped designs.
 
     Raises
     ------
     DataError
-        If there is no such detector, the named object is no detector, or ``patches`` are given to a detector other
-        than ``template``.
+        If the name is unknown, the named object is not a detector, or ``patches`` are given to a detector other than
+        ``template``.
 
     Examples
     --------
@@ -204,7 +204,7 @@ def _is_plain(value: object) -> bool:
 
 
 def _set_threshold(detector: Any, threshold: float | None) -> Any:
-    """Return a copy of the detector with this threshold. Without a threshold to set, return the detector itself."""
+    """Return a copy of the detector with this threshold, or the detector itself if it has no threshold to set."""
     if threshold is not None and hasattr(detector, "threshold"):
         detector = copy(detector)
         detector.threshold = threshold

@@ -46,7 +46,7 @@ class PredictionRun:
 
 
 ImageResult = tuple[Detections, str]
-"""Detections in an image, and the message of the error that the detector raised on it, or ""."""
+"""Detections in an image, and the message of the detector's error, "" without an error."""
 
 
 def predict(
@@ -121,13 +121,15 @@ def predict_images(
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
 ) -> PredictionRun:
-    """Run a detector over images that have no truth; ``image_id`` is the position of an image in the source.
+    """Run a detector over images that have no truth.
+
+    The ``image_id`` of an image is its position in the source.
 
     Parameters
     ----------
     source : ImageSource
-        From :func:`kpbench.images.open_images`. Ctrl-C ends a source of unknown length, such as a camera. The
-        detections up to then are kept.
+        From :func:`kpbench.images.open_images`. Ctrl-C ends a source of unknown length, such as a camera, and keeps the
+        detections so far.
     detector, threshold, overlay, progress
         As for :func:`predict`.
 
@@ -182,7 +184,7 @@ def _collect(
 def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> ImageResult:
     try:
         found = detector(image)
-    except (Exception, SystemExit) as error:  # a detector of the user may raise anything
+    except (Exception, SystemExit) as error:  # a user's detector may raise any exception
         return Detections.none(), f"{type(error).__name__}: {in_one_line(error)}{_user_line(error)}"
     return _apply_threshold(found, threshold), ""
 
@@ -192,7 +194,7 @@ def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
 
 
 def _user_line(error: BaseException) -> str:
-    """Return file and line of the user's code that raised an error, or "" if no user's code did."""
+    """Return file and line of the innermost call outside kpbench that led to an error, "" if no such call did."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
@@ -206,7 +208,9 @@ def _load_once(name: str, threshold: float | None) -> LoadedDetector:
 def detect_images(
     dataset: Dataset, detector: str | LoadedDetector, threshold: float | None, positions: range, progress: Progress
 ) -> dict[int, ImageResult]:
-    """Run a detector over some images of a dataset; the other parameters are those of :func:`predict`.
+    """Run a detector over some images of a dataset.
+
+    The parameters that are not listed below are described at :func:`predict`.
 
     Parameters
     ----------

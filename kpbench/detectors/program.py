@@ -1,4 +1,4 @@
-"""Detectors that are programs: images go out as PNG files, a predictions file comes back."""
+"""Detectors that are programs. A program reads images from PNG files and writes a predictions file."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
     DataError
         If the program cannot be started, ends with an exit code other than 0, writes no FILE, or leaves out an image.
     PredictionsError
-        If FILE is no predictions file.
+        If FILE is not a predictions file.
     """
     with tempfile.TemporaryDirectory(prefix="kpbench-") as scratch:
         folder, out = Path(scratch) / "images", Path(scratch) / "predictions.json"

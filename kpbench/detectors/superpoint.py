@@ -1,4 +1,4 @@
-"""The reference detector: SuperPoint's two heads from an ONNX file, decoded in NumPy and OpenCV.
+"""The reference detector: a SuperPoint network with two heads from an ONNX file, decoded with NumPy and OpenCV.
 
 The network gives logits for each cell of 8x8 px. :func:`decode` turns the logits into one probability map at full
 resolution. A keypoint is the centre of mass of the probability in a window around a local maximum. The window may cross
@@ -35,17 +35,17 @@ EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
 
 # Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images over
 # training photographs: notebook/training-log.md, "Weaker places, longer ellipses, and judges on their poses" and "Fewer
-# looks, and what ten thousand more images were worth". The source of the other two settings is not recorded.
+# looks, and what ten thousand more images were worth". The source of MERGE_DISTANCE_PX and DISC_SHARE is not recorded.
 CANDIDATE_SCORE = 0.015
-"""A place is verified if the network gives at least this score."""
+"""Least network score of a place that is verified."""
 SCALES = (1.2, 0.5, 0.25)
 """Scales of the image that the network sees: enlarged for small patches, shrunk for large patches."""
 VERIFIED_THRESHOLD = 0.3
 """Least score of a verified detection."""
 MERGE_DISTANCE_PX = 3.0
-"""Of two candidates nearer to each other than this, the better is kept. Two scales may find one keypoint twice."""
+"""If two candidates are nearer than this, px, only the better is kept. Two scales may find one keypoint twice."""
 DISC_SHARE = 0.6
-"""Distance in short semi-axes. Of two detections nearer to each other, the likelier is kept."""
+"""If two detections are nearer than this, in short semi-axes of the likelier, only the likelier is kept."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Decoding:
     ----------
     threshold : float
         Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
-        Below 0.01, some keypoints are missed, as the pixels of empty cells count as 0.
+        A threshold below 0.01 still misses some keypoints, as the pixels of empty cells count as 0.
     separation_px : int
-        Distance, px. Of two maxima nearer to each other, the better is kept. Two discs that do not overlap have centres
-        further apart if their short axes are at least 10 px long.
+        If two maxima are nearer than this, px, only the better is kept. The default keeps both centres of two discs
+        side by side whose short axes are at least 10 px long.
     window_px : int
         Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The score is the sum of
         the probability in the window. The place is the centre of mass.
@@ -110,12 +110,12 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
 def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
     """Return places (n, 2) px and scores (n,) of keypoints from detector logits (65, h, w), best first."""
     probability = keypoint_probability(detector_logits)
-    # a light smoothing ranks neighbours within a blob, so that one blob has one maximum
+    # a light smoothing removes small bumps, so that each blob has one maximum
     ranked = cv2.GaussianBlur(probability, (5, 5), 1.0, borderType=cv2.BORDER_CONSTANT)
     side = 2 * decoding.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
-    # a window whose sum reaches the threshold has a maximum of at least its mean; 0.5 allows for the smoothing
+    # if the sum of a window reaches the threshold, the maximum is at least threshold / width²; 0.5 allows for smoothing
     found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])
@@ -191,7 +191,7 @@ def pad_to_cells(grey: UInt8) -> UInt8:
 
 @dataclass
 class SuperPointDetector:
-    """SuperPoint, with its candidates verified by the designs; call the detector with an image.
+    """SuperPoint, whose candidates are compared with the designs; call the detector with an image.
 
     Attributes
     ----------
@@ -214,7 +214,7 @@ class SuperPointDetector:
     Raises
     ------
     DataError
-        If the file cannot be read or was not written by kpbench, there is no scale, or a scale is not in (0, 16].
+        If the file cannot be read or was not written by kpbench, ``scales`` is empty, or a scale is not in (0, 16].
 
     Examples
     --------
@@ -270,12 +270,12 @@ class SuperPointDetector:
     detect = __call__
 
     def batch(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Return the detections in each of several images of one size; the network sees all images of a scale at once.
+        """Return the detections in each of several images of one size. At each scale, the network runs once.
 
         Raises
         ------
         DataError
-            If an array is no image, or the images differ in size.
+            If an array is not an image, or the images differ in size.
         """
         greys = [to_grey(image) for image in images]
         if len({grey.shape for grey in greys}) > 1:

@@ -40,7 +40,7 @@ def suppress(xy: Float, score: Float, distance_px: float | Float) -> Int:
     kept = np.ones(len(order), bool)
     if len(order):
         pairs = cKDTree(xy[order]).query_pairs(reach.max(), output_type="ndarray")
-        better, worse = pairs.min(axis=1), pairs.max(axis=1)  # a lower rank is better
+        better, worse = pairs.min(axis=1), pairs.max(axis=1)  # the best point has rank 0
         near = np.hypot(*(xy[order[better]] - xy[order[worse]]).T) < reach[better]
         by_rank = np.flatnonzero(near)[np.argsort(better[near], kind="stable")]
         for one, other in zip(better[by_rank].tolist(), worse[by_rank].tolist(), strict=True):

@@ -1,8 +1,8 @@
 """Detectors of tags, for comparison with patches: one for each board of :data:`kpbench.patches.TAG_BOARDS`.
 
-Settings are the libraries' defaults, except for the settings named below. The exceptions were chosen in favour of the
-tags, on scenes of another seed than the benchmark's (docs/explanation/fairness-to-tags.md). The detectors of ArUco and
-AprilTag do not know the board: they report every tag of their dictionary.
+Settings are the libraries' defaults, except for the settings named below. These exceptions favour the tags. They were
+chosen on scenes whose seed differs from the benchmark's seed (docs/explanation/fairness-to-tags.md). The detectors of
+ArUco and AprilTag do not know the board: they report every tag of their dictionary.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from kpbench.types import Detections, UInt8
 APRILTAG_DECIMATION = 1.5
 """Factor by which the AprilTag library shrinks the image. The library detects fewer tags with a factor of 1 or 2."""
 LEAST_APRILTAG_SIDE_PX = 8
-"""The AprilTag library crashes on an image of a few px. An image whose shorter side is below this holds no tag."""
+"""Least shorter side of an image, px. A smaller image has no detections, as the library crashes on tiny images."""
 
 
 class ArucoDetector:
     """OpenCV's ArUco detector.
 
-    Corners are refined with lines along the edges. OpenCV's other refinements detect fewer tags.
+    Corners are refined by lines fitted to the edges. With OpenCV's other refinements, the detector finds fewer tags.
     """
 
     name = board = "aruco"
@@ -46,7 +46,7 @@ class ArucoDetector:
 
 
 class AprilTagDetector:
-    """The AprilTag library's own detector, which detects more tags than OpenCV's detector of the same dictionary.
+    """The AprilTag library's own detector. It detects more tags than OpenCV's detector with the same dictionary.
 
     Raises
     ------

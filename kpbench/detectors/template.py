@@ -1,13 +1,13 @@
-"""A classical detector without training, for any design with straight edges that cross at its centre.
+"""A classical detector, which needs no training, for any design with straight edges that cross at its centre.
 
-1. Crossings (:func:`find_crossings`). Straight edges through a point stay straight under any perspective. The gradients
-   on these edges are perpendicular to the line to the point. A pixel is a crossing if the gradients around the pixel
-   are perpendicular to the line to the pixel, and have more than one direction. This is a form of the operator of
-   Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and centres of
-   circular features*, 1987. The operator needs no templates. A few hundred places remain.
+1. Crossings (:func:`find_crossings`). A straight edge through a point stays straight under any perspective. Gradients
+   on this edge are perpendicular to the edge. A pixel is a crossing if each gradient around the pixel is perpendicular
+   to the line from its place to the pixel, and the gradients have more than one direction. This is a form of the
+   operator of Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and
+   centres of circular features*, 1987. The operator needs no templates. A few hundred places remain.
 2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
    at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
-3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels in the last poses.
+3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels, from the remaining poses.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from kpbench.types import Detections, Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
 VERSION = "1"
-"""Version of the method. Raise it by one when detections change."""
+"""Version of the method. Raise the version by one when detections change."""
 
 
 @dataclass(frozen=True)
@@ -39,16 +39,17 @@ class Thresholds:
     Attributes
     ----------
     window_px : float
-        Standard deviation of the window of :func:`find_crossings`, px of a level. Gradients at distances of 1 to 3 px
-        have the most weight.
+        Standard deviation of the window of :func:`find_crossings`, px of a pyramid level. Gradients at distances of 1
+        to 3 px have the most weight.
     radial : float
-        Weight of gradients along the line to the place; they count against a crossing.
+        Weight of the gradients that point towards the place or away from the place. These gradients lower the strength
+        of a crossing.
     octaves : int
         Number of levels of the pyramid in which crossings are searched.
     px_per_place, places : int
         A level of n pixels keeps ``n // px_per_place + places`` crossings.
     margin : float
-        A design is left out at a place if its correlation is more than this below the best design's correlation.
+        A design is dropped at a place if its correlation is lower than the best design's correlation by more than this.
     search_ncc : float
         Least correlation near the centre after the search.
     align_steps, align_ncc : tuple
@@ -69,7 +70,7 @@ class Thresholds:
     likeness : float
         Least :meth:`ScoreWeights.likeness` of a candidate that is fitted.
     disc_share : float
-        A detection is dropped if a better detection has its centre nearer than this, in radii of the better disc.
+        A detection is dropped if the centre of a better detection is nearer than this, in radii of the better disc.
     """
 
     window_px: float = 1.1
@@ -95,8 +96,8 @@ class ScoreWeights:
     """Weights of the score: a logistic regression on five measures of a candidate.
 
     Source: fitted to candidates in synthetic images over training photographs, under every deterioration of the paper.
-    A candidate was right if it lay within a tenth of the radius of a true centre and had the right design. A candidate
-    was wrong if it lay on no patch. All other candidates were left out.
+    A candidate with the right design within a tenth of the radius from a true centre was right. A candidate on no patch
+    was wrong. All other candidates were left out.
 
     Attributes
     ----------
@@ -105,11 +106,11 @@ class ScoreWeights:
     core, whole : float
         Weights of log(1.01 − correlation), for the correlations near the centre and over the disc.
     unexplained : float
-        Weight of the log of the residuals that the image's noise does not explain, in contrasts.
+        Weight of the log of the ratio of the fit's residuals beyond the image's noise to the contrast.
     blur : float
         Weight of the blur, in short semi-axes.
     contrast : float
-        Weight of the log of the contrast divided by the image's range of grey levels.
+        Weight of the log of the ratio of the contrast to the image's range of grey levels.
     """
 
     offset: float = -12.55
@@ -140,7 +141,7 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     xy : ndarray of shape (n, 2)
         The strongest places, whole px. Their number grows with the size of the level, see :class:`Thresholds`.
     strength : ndarray of shape (n,)
-        In falling order.
+        Strengths of the places, in descending order.
     """
     gx = cv2.Scharr(level, cv2.CV_32F, 1, 0, scale=1 / 32)
     gy = cv2.Scharr(level, cv2.CV_32F, 0, 1, scale=1 / 32)
@@ -157,8 +158,8 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     radial = xx_x + 2 * xy_xy + yy_y  # sum of w (g·q)²
     a, c = xx_x + moment(xx, 0, 2), yy_y + moment(yy, 2, 0)
     b = moment(xy, 2, 0) + moment(xy, 0, 2)
-    # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt the root falls as the area does; the smaller
-    # eigenvalue, which is a usual measure of corners, falls faster
+    # square root of the determinant of the sum of w |q|² g gᵀ. Under tilt, the root falls in proportion to the area of
+    # the patch. The smaller eigenvalue, a usual measure of corners, falls faster
     spread = np.sqrt(np.maximum(a * c - b * b, 0))
     strength = (spread - TEMPLATE_THRESHOLDS.radial * radial) / np.sqrt(a + c + 50.0)
     strength[[0, -1]], strength[:, [0, -1]] = 0, 0
@@ -173,7 +174,7 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The n fits of one image, before overlaps and low scores are removed.
+    """The n fits of one image, before fits that overlap better fits and fits with low scores are removed.
 
     Attributes
     ----------
@@ -272,7 +273,7 @@ class TemplateDetector:
     detect = __call__
 
     def candidates(self, grey: UInt8) -> Candidates:
-        """Return the fits of all places in a grey image that look enough like a design."""
+        """Return the fits of all places in a grey image that resemble a design."""
         templates, pyramids = build_templates(self.patches), Pyramids(grey)
         raw, smooth = pyramids.raw, pyramids.smooth
         poses = search_sectors(smooth, *_find_places(raw[0], smooth), templates, TEMPLATE_THRESHOLDS.margin)
@@ -285,7 +286,7 @@ class TemplateDetector:
         core = poses[_select_distinct(poses)[: max(most, most * grey.size // (640 * 480))]]
         row, rotated = core_symmetries(estimate_size(smooth, core, templates), templates)
         whole = align_poses(smooth, rotated, templates.whole, TEMPLATE_THRESHOLDS.whole_steps, WHOLE_RADIUS_PX)
-        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # best rotation of each
+        whole = whole[np.lexsort((-whole.ncc, row))[np.unique(row, return_index=True)[1]]]  # best rotation of each core
         alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
@@ -301,7 +302,7 @@ def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
 
 
 def _select_distinct(poses: Poses) -> Int:
-    """Return indices of poses, best first.
+    """Return the indices of the kept poses; the poses come best first.
 
     A pose near a better pose is kept only if it has another design and a correlation that is nearly as high.
     """
@@ -318,7 +319,7 @@ def _select_distinct(poses: Poses) -> Int:
 
 
 def _select_uncovered(xy: Float, A: Float) -> Int:
-    """Return indices of points, best first, without the points that lie in the disc of a better kept point."""
+    """Return the indices of the points outside the discs of all better kept points; the points come best first."""
     offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
     inside = np.linalg.norm(offset, axis=2) < TEMPLATE_THRESHOLDS.disc_share
     kept = np.zeros(len(xy), bool)

@@ -10,9 +10,9 @@ A candidate is a place with a score and with probabilities of the designs. The v
    and measured :class:`~kpbench.detectors.hypotheses.Evidence`. It gives the log odds that the hypothesis is right, and
    corrects the pose. Likely hypotheses are shown to the judge once more, in the corrected pose (:func:`look_again`).
 4. Fit (:func:`fit_hypotheses`). The design is fitted to the pixels (:func:`kpbench.fitting.fit`).
-5. Second judge (:func:`judge`). A small network sees the fitted hypothesis. Its evidence also compares the hypothesis
-   with the other patches of the image, as the patches of an image have similar blur and contrast. The log odds of the
-   second judge are the result.
+5. Second judge (:func:`judge`). A small network sees the fitted hypothesis. The evidence now also compares the
+   hypothesis with the other patches of the image, as the patches of an image have similar blur and contrast. The log
+   odds of the second judge are the result.
 
 :mod:`kpbench.training.verifier` trains the three networks on synthetic images.
 """
@@ -57,32 +57,32 @@ ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 # of them in "Specks, sizes, and how many places an image has" and in "Fewer looks, and what ten thousand more images
 # were worth".
 ID_MARGIN = 3.0
-"""A design is tried if the ID head gives a log probability at most this far below the likeliest design's."""
+"""A design is tried if its log probability from the ID head is within this margin of the likeliest design's."""
 ALL_DESIGNS_LOG_ODDS = 0.0
-"""With at least these log odds of the ellipse, all designs are tried, whatever the ID head says."""
+"""With at least these log odds from the ellipse network, all designs are tried, whatever the ID head says."""
 THOROUGH_LOG_ODDS = -4.8
-"""With at least these log odds of the ellipse, other sizes of the ellipse and a second rotation are tried."""
+"""With at least these log odds from the ellipse network, other ellipse sizes and a second rotation are tried."""
 LEAST_ELLIPSE_LOG_ODDS = -6.5
-"""With lower log odds of the ellipse, the place is dropped."""
+"""A place with lower log odds from the ellipse network is dropped."""
 SECOND_LOOK_LOG_ODDS = -5.0
-"""With lower log odds at the first look, a hypothesis is dropped."""
+"""A hypothesis with lower log odds at the first look is dropped."""
 LEAST_FIT_LOG_ODDS = -3.5
-"""With lower log odds at the second look, a hypothesis is not fitted."""
+"""A hypothesis with lower log odds at the second look is not fitted."""
 LARGEST_FIT_MOVE = 0.1
-"""Short semi-axes. After a larger move of the centre, the pose before the fit is kept, which is right more often."""
+"""If a fit moves the centre further than this, in short semi-axes, the earlier pose is kept: it is right more often."""
 USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. The judges' log odds hold for such an image."""
+"""Number of candidates in a typical training image of 640x480 px. The judges' log odds apply to such images."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
-"""Least half contrast of a hypothesis, and least contrast of a fit in the evidence, grey levels."""
+"""Grey levels. Hypotheses need a larger half contrast. In the evidence, lower contrasts of fits are raised to this."""
 PLACES_PER_BLOCK = 2**11
-"""Number of places that the ellipse network sees in one call. This limit bounds the memory."""
+"""Largest number of places that the ellipse network sees in one call. The limit bounds the memory."""
 
 
 @dataclass(frozen=True)
 class VerifiedCandidates:
-    """The n candidates that were fitted, each with its likeliest design.
+    """The n candidates that were fitted and are large enough, each with its likeliest design.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # more candidates than usual do not mean more patches, so each candidate is then less likely a patch
+    # more candidates than usual do not mean more patches, so each candidate is less likely to be a patch
     log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
@@ -283,8 +283,8 @@ def _measure(
 def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patches: Sequence[Patch]) -> Hypotheses:
     """Return hypotheses in the poses that fit the pixels best, with the evidence of the fit.
 
-    A hypothesis keeps its pose if the fit moved the centre further than ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) are
-    the first judge's.
+    A hypothesis keeps its pose if the fit moved the centre further than ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) come
+    from the first judge.
     """
     fits = fit(pyramids.raw, before.xy, before.A, [patches[n] for n in before.design])
     contrast, minor = np.maximum(fits.white - fits.black, LEAST_CONTRAST), clipped_semi_axis(fits.A)
@@ -370,7 +370,7 @@ def _open(network: str, threads: int) -> InferenceSession:
 
 
 def _contrast_evidence(contrast: Float, pyramids: Pyramids) -> list[Float]:
-    """Return the logs of contrasts (n,), grey levels, divided by the image's range of grey levels and by its noise."""
+    """Return the logs of the ratios of contrasts (n,) to the image's range of grey levels and to the image's noise."""
     return [np.log(contrast / (pyramids.grey_range + 5)), np.log(contrast / (pyramids.noise + 1))]
 
 

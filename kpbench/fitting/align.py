@@ -25,11 +25,11 @@ from kpbench.fitting.templates import DesignTemplates, Templates
 from kpbench.types import Float, Float32, Int
 
 AMBIGUOUS_NCC = 0.15
-"""A second rotation is kept if its correlation with the image is at most this far below the best rotation's."""
+"""A second rotation is kept if its correlation with the image is within this margin of the best correlation."""
 DISTINCT_NCC = 0.5
 """Two rotations of a design are distinct if their templates correlate by less than this."""
 RADIUS_FACTORS = (0.8, 0.9, 1.1)
-"""Sizes of an ellipse that are tried besides the given size: a patch's rings or ground may have biased that size."""
+"""Factors of an ellipse's size that are tried besides 1, as rings or the ground may have biased the given size."""
 WHOLE_RADIUS_PX = 5.6
 """The whole design is compared in the coarsest level in which its short semi-axis measures at least this, px."""
 LARGEST_STEP = 0.35
@@ -83,7 +83,7 @@ def rotate_within_ellipse(
     templates: DesignTemplates,
     thorough: NDArray[np.bool_] | None = None,
 ) -> tuple[Int, Poses]:
-    """Find the rotation of a design within an ellipse, and a second rotation if it is nearly as likely.
+    """Find the rotation of a design within an ellipse, and a second rotation if its correlation is nearly as high.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
 
 
 def _compare(values: Float32, ink: Float32, cut: Int, outside: NDArray[np.bool_]) -> tuple[Float32, Float32]:
-    """Return the correlations (N,) of grey values with templates, and the residuals (N, M) in units of the templates.
+    """Return the correlations (N,) of grey values with templates, and the residuals (N, M) in units of the ink.
 
     The rows ``cut`` have samples outside the image. These samples do not count in the correlation, and their residual
     is 0.

@@ -24,11 +24,11 @@ COARSE_PX, COARSE_STEPS = 30.0, 2
 FINE_PX, FINE_STEPS = 100.0, 3
 """The last ``FINE_STEPS`` steps use the finest level with a long semi-axis of at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
-"""Short semi-axes. After a step that moved a patch by at most this, no further step is taken in the same level."""
+"""If a step moves a patch by at most this, in short semi-axes, no further step is taken in the same level."""
 LEVEL_BLUR_PX = 0.6
-"""Standard deviation of the blur that the pyramid adds to a coarser level than the image, in px of the level."""
+"""Standard deviation of the pyramid's own blur in every level but level 0, px of the level."""
 MODEL_REACH = 1.3
-"""The outermost ring is rendered to this many times its radius, so that no blurred outer edge reaches the patch."""
+"""The outermost ring is drawn out to this many times its radius, so that its blurred outer edge misses the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective: standard deviation of ``bend``, per px of the short semi-axis."""
 LEAST_PIXELS = 12
@@ -85,7 +85,7 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
         semi-axis measures 15 to 30 px, the last steps in the level in which it measures 50 to 100 px. For a smaller
         patch, the steps are taken in the image itself.
     xy, A : ndarray of shape (N, 2) and (N, 2, 2)
-        Poses to start from, px. They must be right to about a tenth of the radius.
+        Starting poses, px. The poses must be right to about a tenth of the radius.
     patches : sequence of Patch
         N designs.
 
@@ -127,11 +127,11 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
 
 @dataclass(frozen=True)
 class _State:
-    """One patch during the fit, in px of its level.
+    """One patch during the fit, in px of the pyramid level.
 
-    ``window`` is the map that the fit started from. With this map about ``xy``, the pixels inside the patch's extent
-    count, except for a margin at the rim. ``bend`` holds the first two entries of the last row of the homography.
-    ``moved`` is the size of the last step, in short semi-axes.
+    ``window`` is the map that the fit started from. This map, centred at ``xy``, decides which pixels count: the pixels
+    inside the patch's extent, except for a margin at the rim. ``bend`` holds the first two entries of the last row of
+    the homography. ``moved`` is the size of the last step, in short semi-axes.
     """
 
     xy: Float
@@ -195,7 +195,7 @@ def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
 
 
 def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, last: bool) -> _State:
-    """Measure the residuals of a state and, unless it is the ``last`` step, take one Gauss-Newton step."""
+    """Measure the residuals of a state. Unless ``last`` is true, also take one Gauss-Newton step."""
     x, y, w, h = box
     rows, columns = image.shape
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, columns), min(y + h, rows)
@@ -253,7 +253,7 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, and the square of the
     blur.
     """
-    damped = np.arange(4, 11)  # a design of sectors alone does not determine its size and some stretches
+    damped = np.arange(4, 11)  # a design of sectors alone leaves its size and some stretches undetermined
     normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
     normal[[0, 1, 2, 3], [0, 1, 2, 3]] += 1e-3
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2
@@ -265,7 +265,7 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     grow = grow * min(1.0, 0.2 * minor / max(float(np.abs(grow).max()), 1e-9))
     blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[10], -1, 1), 0.04, (0.5 * minor) ** 2)))
     bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
-    # the whole model stays in front of the camera
+    # a stronger bend would put part of the model behind the camera
     bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend)), 1e-9)))
     moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
     return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kpbench.types import Float, Float32, Int, UInt8
 
 MOST_LEVELS, LEAST_SIDE_PX = 7, 16
-"""Largest number of levels, and shorter side of the smallest level that is halved once more, px."""
+"""Largest number of levels, and least shorter side of a level that is halved again, px."""
 REMAP_ROWS = 2**14
 """Largest number of poses that are sampled in one call, as OpenCV's remap takes fewer than 2**15 rows."""
 LEAST_DEVIATION = 1.0
@@ -25,8 +25,8 @@ def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
     ----------
     image : ndarray of shape (H, W), uint8
     smooth_px : float
-        Standard deviation of the Gaussian that smooths level 0, px. 0 leaves level 0 unchanged. Every other level is
-        smoothed by 0.5 to 0.6 px of that level.
+        Standard deviation of the Gaussian that smooths level 0, px. 0 leaves level 0 unchanged. The
+        standard deviation in a coarser level is 0.5 to 0.6 px of that level.
 
     Returns
     -------
@@ -88,7 +88,7 @@ def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, p
     Returns
     -------
     ndarray of shape (N, M), float32
-        A sample outside the image has the value at the border.
+        A sample outside the image has the value of the nearest point of the image.
     """
     values = np.empty((len(xy), len(points)), np.float32)
     fan = points.T.astype(np.float32)
@@ -113,7 +113,7 @@ def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> 
     Returns
     -------
     rows : ndarray of shape (K,), int64
-        Indices of the poses. A few may have all samples inside.
+        Indices of the poses. A few of these poses may have all samples inside.
     outside : ndarray of shape (K, M), bool
     """
     last = np.array(image.shape[::-1]) - 1.0

@@ -1,4 +1,4 @@
-"""Poses of designs from a rough place and scale alone.
+"""Poses of designs, searched from rough places and scales.
 
 The search uses the innermost sectors of a design, which look the same at every size. :func:`search_sectors` samples
 circles around each place under many tilts. The samples are correlated with the sectors of each design in each rotation.
@@ -29,7 +29,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 CORE_RADIUS_PX = 3.0
-"""Short semi-axis of the core's circle, px of the level that is searched. The smallest patches measure 5 px."""
+"""Short semi-axis of the core's circle, px of the searched level. The circle fits into patches of 5 px radius."""
 SPOKES = 40
 """Samples on each circle of :func:`estimate_size`."""
 RING_RADII = 0.7 * 1.12 ** np.arange(34)
@@ -37,13 +37,13 @@ RING_RADII = 0.7 * 1.12 ** np.arange(34)
 FIRST_RINGS = 12
 """Number of circles that are sampled first. At most places without a patch, no further circles are needed."""
 AGREEING_SHARE = 0.7
-"""A circle belongs to the patch if at least this share of its votes is for the predicted ink."""
+"""A circle belongs to the patch only if at least this share of its votes is for the predicted ink."""
 VOTING_SHARE = 0.3
-"""A circle belongs to the patch if at least this share of its samples votes for the predicted ink."""
+"""A circle belongs to the patch only if at least this share of its samples votes for the predicted ink."""
 VOTE_OFFSET = 0.4
 """A sample votes for the predicted ink if its agreement with this ink, from -1 to 1, is larger than this."""
 BLOCK = 2**11
-"""Number of poses that are measured together. This limit bounds the memory."""
+"""Largest number of poses that are measured together. The limit bounds the memory."""
 _TILTS = ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9))
 """Tilts that are searched: ratio of short to long semi-axis, and number of directions of the tilt."""
 
@@ -75,12 +75,12 @@ def search_sectors(
         Pyramid level to search; the core's circle has a short semi-axis of ``CORE_RADIUS_PX · 2^level`` px.
     templates : DesignTemplates
     margin : float
-        A design is left out at a place if its correlation is more than this below the best design's correlation.
+        A design is dropped at a place if its correlation is lower than the best design's correlation by more than this.
 
     Returns
     -------
     Poses
-        One or more designs per place, in the order of the places; ``A`` maps the unit circle of the core.
+        One or more designs per place, in the order of the places; ``A`` maps the unit circle of the core to px.
     """
     core, scale = templates.core, CORE_RADIUS_PX * 2.0**level
     starts = np.searchsorted(core.rotated_design, np.arange(len(templates.patches)))

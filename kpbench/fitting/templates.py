@@ -22,7 +22,7 @@ CORE_ROTATIONS = 24
 WHOLE_ROTATIONS = 72
 """Number of rotations of the whole design that are tried: 5 degrees apart, which is close enough for a fit."""
 CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
-"""Radii of the circles that are sampled, in radii of the core's circle and in radii of the disc."""
+"""Radii of the sampled circles: of a core in radii of the core's circle, of a whole design in radii of the disc."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
 """Standard deviation of a template's blur, in the units of the radii, to match the smoothing of the image pyramid."""
 SAME_NCC = 0.998
@@ -46,13 +46,13 @@ class Templates:
     points : ndarray of shape (M, 2)
         Sample points in the frame of the template.
     ink : ndarray of shape (D, M), float32
-        Zero mean and unit norm per design.
+        Inks at the points, with zero mean and unit norm per design.
     solve : ndarray of shape (D, 6, M), float32
         Maps a residual to a Gauss-Newton step in (x, y, a11, a12, a21, a22).
     has_size : ndarray of shape (D,), bool
         Whether the template looks different at another size; sectors look the same.
     rotated : ndarray of shape (R, M), float32
-        Inks of all designs in all rotations, without rotations that look like an earlier one.
+        Inks of all designs in all rotations, without rotations that look like an earlier rotation.
     rotated_design : ndarray of shape (R,), int64
         Index of the design in each row of ``rotated``.
     rotated_angle : ndarray of shape (R,)

@@ -37,11 +37,11 @@ def rectify(
     Returns
     -------
     views : ndarray of shape (N, VIEW_PX²), float32
-        Ink, clipped to ±INK_LIMIT; nan outside the image. White is 1 and black is -1, by a least-squares line over the
-        pixels of the disc.
+        Inks: white is 1 and black is -1. A line maps grey levels to inks. The line is fitted by least squares to the
+        pixels of the disc. Inks are clipped to ±INK_LIMIT, and nan outside the image.
     half_contrast : ndarray of shape (N,)
-        Half the difference of white and black, grey levels, clipped to ``HALF_CONTRAST_RANGE``. The lower limit stands
-        also for a white that is darker than the black.
+        Half the difference of white and black, grey levels, clipped to ``HALF_CONTRAST_RANGE``. The lower limit is also
+        returned if white is darker than black.
     """
     points = view_points()
     px = short_semi_axis(A) * 2 * VIEW_REACH / VIEW_PX

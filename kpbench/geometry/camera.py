@@ -69,12 +69,12 @@ class Camera:
         return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
 
     def project(self, points_camera: ArrayLike) -> Float:
-        """Return the image points in px, shape (N, 2), of points of the camera frame, shape (N, 3), z > 0."""
+        """Return the image points (N, 2), px, of points (N, 3) in the camera frame. Every z must be positive."""
         points = np.asarray(points_camera, np.float64)
         return self.distort(points[:, :2] / points[:, 2:])
 
     def distort(self, rays: Float) -> Float:
-        """Return the image points in px, shape (N, 2), of rays (x, y), shape (N, 2)."""
+        """Return the image points (N, 2), px, of rays (x, y), shape (N, 2)."""
         k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(rays, np.float64).T
         r2 = x * x + y * y

@@ -3,8 +3,8 @@
 Each pixel gets the area of the polygon within the pixel, without sampling. The algorithm:
 
 1. Cut every edge into pieces at the pixel borders.
-2. For each piece, add the signed area right of the piece to its own pixel, and the rest of the height of the piece to
-   the pixel on the right.
+2. For each piece, add the signed area between the piece and the right border of its pixel to this pixel. Add the rest
+   of the signed height of the piece to the pixel on the right.
 3. Sum along the rows. The sum carries the height of each piece to all pixels right of the piece.
 
 The cost of steps 1 and 2 grows with the length of the outline, not with the area inside.
@@ -101,7 +101,8 @@ def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: S
     base = np.concatenate([[0], np.cumsum(width * height)])
     corner = np.stack([x - 0.5, y - 0.5])[:, owner]
     signed = _accumulate(start - corner, end - corner, base[owner], width[owner], int(base[-1]))
-    # the sum over a region is zero, so a single running sum serves all regions; abs, as outer polygons run either way
+    # a region's entries sum to zero, so one running sum serves all regions; outer polygons may run in either direction,
+    # so the sum may be negative
     covered = np.cumsum(signed)
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
     return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
@@ -125,7 +126,7 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
     with np.errstate(divide="ignore", invalid="ignore"):
         cut = np.where(first != last, (np.maximum(first, last) - start) / step, 0.0)
     early, late = np.minimum(cut[0], cut[1]), np.maximum(cut[0], cut[1])
-    # each part has up to three pieces: to the first border, between both borders, from the last border to the end
+    # a part has up to three pieces: from the start to the first border, to the second border, and to the end
     has_first, has_second = np.flatnonzero(early), np.flatnonzero(late > early)
     part = np.concatenate([has_first, has_second, np.arange(len(late))])
     begin = np.concatenate([np.zeros(len(has_first)), early[has_second], late])

@@ -150,14 +150,15 @@ def move(region: Region, x: float, y: float, scale: float = 1.0, rotate_deg: flo
 def flatten(region: Region, tolerance: float) -> list[Float]:
     """Approximate every contour by a closed polygon.
 
-    Each arc becomes chords that enclose the same area as the arc, see :func:`arc_vertices`. The distance between the
-    chords and the arc is at most ``tolerance``. The mean signed distance along the arc is zero to first order.
+    Each arc becomes chords. The chords of a full circle enclose the area of the circle, see :func:`arc_vertices`. An
+    open arc has the same chords, but keeps its exact end points. The distance between the chords and the arc is at most
+    about 4/3 of ``tolerance``.
 
     Parameters
     ----------
     region : tuple of contours
     tolerance : float
-        Largest distance between an arc and its chords, in the unit of the region.
+        In the unit of the region. Arcs and chords differ by at most about 4/3 of this distance.
 
     Returns
     -------
@@ -201,7 +202,7 @@ def _vertices(part: Line | Arc, tolerance: float) -> Float:
     """Return the vertices of one segment without its last point, which is the first point of the next segment."""
     if isinstance(part, Line):
         return np.array([[part.x0, part.y0]])
-    # a chord over the angle 2h is up to r (1 - cos h) ~ r h² / 2 off the arc; equal areas halve this distance
+    # the chords over an angle 2h are up to about r h² / 3 off the arc: at the vertices, which lie outside the arc
     half = np.sqrt(4 * tolerance / part.radius) if tolerance < part.radius else np.pi / 4
     count = max(2, int(np.ceil(abs(np.radians(part.sweep_deg)) / (2 * half))))
     step = np.radians(part.sweep_deg) / count

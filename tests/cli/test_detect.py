@@ -343,5 +343,5 @@ def test_images_of_several_sizes_make_no_video(folder, plug):
     photos(folder, 2)
     cv2.imwrite(str(folder / "photos" / "z.png"), np.zeros((30, 40, 3), np.uint8))
     result = kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", code=1)
-    assert result.stderr.startswith("kpbench: out.mp4: z.png is of another size than those before, expected a folder")
+    assert result.stderr.startswith("kpbench: out.mp4: z.png differs in size from the images before, expected a folder")
     assert not (folder / "out.mp4").exists()
