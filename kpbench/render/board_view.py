@@ -1,4 +1,4 @@
-"""Views of a board before a camera: light, exact rendering, and the truth.
+"""Views of a board in front of a camera: light, exact rendering, and the truth.
 
 Ink and paper are projected as outlines and painted by exact area coverage. Even a board that covers 0.5 % of the image
 is therefore not aliased.
@@ -24,7 +24,7 @@ from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 EDGE_WIDTH = 0.008
 """Width of the band along the board's cut edge, in lengths of the board's shorter side."""
 SHADOW_SHIFT = 0.4
-"""Shift of the board's shadow for a slope of the light of 1, in board sides."""
+"""Shift of the board's shadow if the light has a slope of 1, in board sides."""
 SHADOW_BLUR = 0.05
 """Standard deviation of the shadow's soft edge, in board sides."""
 SHADOW_GRID = 64
@@ -35,7 +35,7 @@ RIM_POINTS = 720
 
 @dataclass(frozen=True)
 class Appearance:
-    """Inks and light of a board. A board side is the square root of the board's projected area.
+    """Inks and light of a board. The unit "board side" is the square root of the board's projected area.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Appearance:
         Change of brightness over one board side, to the right and downwards in the image. The light is
         clipped to [0, 1].
     shadow : float
-        Fraction of the light that the board takes from the scene behind it. The shadow has a soft edge and
+        Fraction of the light that the board takes from the scene behind the board. The shadow has a soft edge and
         falls away from the lamp, against the slope.
 
     Examples
@@ -133,7 +133,7 @@ def _ellipse_of_moments(points: Float) -> Ellipse:
 
 
 def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike, appearance: Appearance) -> Rendering:
-    """Paint a board before a background with exact area coverage.
+    """Paint a board in front of a background with exact area coverage.
 
     Parameters
     ----------

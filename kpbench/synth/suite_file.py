@@ -33,7 +33,7 @@ SCENE_KEYS = {
 }
 """Quantities that are drawn for a scene, and the range of values that a suite may set for each quantity.
 
-:func:`kpbench.render.pose_board` explains the pose, :class:`kpbench.render.Appearance` the inks and the light.
+:func:`kpbench.render.pose_board` explains the pose. :class:`kpbench.render.Appearance` explains the inks and the light.
 """
 
 Levels = tuple[tuple[str, tuple[float, ...]], ...]

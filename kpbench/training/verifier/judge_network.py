@@ -1,4 +1,4 @@
-"""The network of both judges."""
+"""The network whose form both judges share."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kpbench.types import Float
 class Judge(nn.Module):
     """Network that takes views and evidence of hypotheses, and returns log odds and corrections of the pose.
 
-    ``evidence`` : training samples (n, columns); their mean and deviation standardise each column.
+    ``evidence`` : training samples (n, columns); their mean and standard deviation standardise each column.
     """
 
     mean: Tensor

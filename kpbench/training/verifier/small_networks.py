@@ -106,8 +106,8 @@ def train_one_cycle(
 def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> None:
     """Give a network the shipped weights; the weights of convolutions are stored in 7 bits.
 
-    The shipped file has no BatchNorm. Each BatchNorm becomes the identity, apart from the bias of its convolution; the
-    inputs ``seen`` give the statistics.
+    The shipped file has no BatchNorm. Each BatchNorm only adds the bias of its convolution; the inputs ``seen`` give
+    the statistics.
     """
     graph = onnx.load(WEIGHTS / f"{name}.onnx").graph
     stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
