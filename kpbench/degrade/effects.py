@@ -69,7 +69,7 @@ def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     >>> round(noise(flat, np.random.default_rng(0), sigma=15).std())
     15
     """
-    # pixels are whole numbers, so noise can be rounded before the addition; a uniform 16-bit number then picks a rounded
+    # pixels are whole numbers, so noise can be rounded before the addition; a uniform 16-bit number picks a rounded
     # quantile, which is quicker than a normal generator
     levels = np.rint(sigma * _normal_quantiles()).astype(np.int16)
     field = levels[np.frombuffer(rng.bytes(2 * image.size), "<u2")].reshape(image.shape)

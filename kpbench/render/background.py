@@ -40,7 +40,7 @@ class Background:
     file : str
         Path of the photograph below its folder; "" for a procedural background.
     broken_files : tuple of str
-        Files that were drawn before ``file`` and could not be decoded.
+        Files that were tried before ``file`` and could not be decoded.
     """
 
     image: UInt8

@@ -1,6 +1,6 @@
 """Poses of a board, and the exact projection of a board into the image, with lens distortion.
 
-The share of the image that the board covers determines its distance, because the experiments fix this share.
+The share of the image that the board covers determines the board's distance, because the experiments fix this share.
 :mod:`kpbench.geometry` describes the frames.
 """
 
@@ -60,19 +60,19 @@ def polygon_area(points: Float) -> float:
 
 
 def project_to_image(camera: Camera, pose: Pose, points_mm: Float) -> Float:
-    """Return the image, shape (n, 2), px, of points on the board, shape (n, 2), mm."""
+    """Return the pixel coordinates, shape (n, 2), of points on the board, shape (n, 2), mm."""
     return camera.project(np.column_stack([points_mm, np.ones(len(points_mm))]) @ pose.M_board2camera.T)
 
 
 def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: float = 0.0) -> Float:
-    """Move the board's outline inwards by ``inset_mm``, and return its image, shape (n, 2), px."""
+    """Return the pixel coordinates, shape (n, 2), of the board's outline, moved inwards by ``inset_mm``."""
     w, h = board.side_x_mm - 2 * inset_mm, board.side_y_mm - 2 * inset_mm
     corners = flatten(rectangle(-w / 2, -h / 2, w, h), 1.0)[0]
     return project_polygon(camera, pose, corners)
 
 
 def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
-    """Project a polygon on the board; its edges are cut into short pieces if the lens bends lines."""
+    """Return the pixel coordinates of a polygon on the board; if the lens bends lines, cut the edges into short pieces."""
     if not any(camera.distortion):
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm

@@ -110,7 +110,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
 
 
 def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
-    """Project evenly spaced points of the patch's unit circle into the image, shape (RIM_POINTS, 2), px."""
+    """Return the pixel coordinates, shape (RIM_POINTS, 2), of evenly spaced points of the patch's unit circle."""
     angles = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.ones(RIM_POINTS)])
     return camera.project(rim @ M_patch2camera.T)
@@ -240,7 +240,7 @@ def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: flo
 def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Appearance) -> None:
     """Darken the scene behind the board, in place.
 
-    The shadow is smooth, so that a coarse grid suffices: the shadow is computed on the grid and enlarged.
+    The shadow is smooth. A coarse grid therefore suffices: the shadow is computed on this grid and enlarged.
     """
     step = max(1, round(side_px / SHADOW_GRID))  # px per pixel of the coarse grid
     blur = SHADOW_BLUR * side_px / step

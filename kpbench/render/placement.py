@@ -23,7 +23,8 @@ LARGEST_DEPTH_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges within which a random scene is drawn. Where the paper gives a range (§3.2), this range is the default.
+    """Ranges within which a random scene is drawn. The defaults are the ranges of the paper (§3.2), where the paper
+    gives a range.
 
     Attributes
     ----------

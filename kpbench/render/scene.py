@@ -239,7 +239,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
         part = image[in_image]
         grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
         black = mask.black[in_box].ravel()
-        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # quicker than an index of the pixels
+        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # quicker than a selection of pixels
         count = weight.sum()
         weighted = weight * black
         # sums, not @: a threaded BLAS costs more than it saves on so few pixels
