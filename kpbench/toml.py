@@ -119,7 +119,7 @@ class TomlTable:
     def numbers(
         self, key: str, low: float, high: float = math.inf, count: int | None = None, whole: bool = False
     ) -> tuple[float, ...]:
-        """Return a list of numbers from ``low`` to ``high``. The list must have ``count`` entries; None allows any count."""
+        """Return numbers from ``low`` to ``high``. If ``count`` is given, the list must have this length."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple) or count not in (None, len(value)):
             raise self.problem(key, f"a list of {'' if count is None else f'{count} '}numbers")

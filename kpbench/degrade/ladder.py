@@ -38,7 +38,7 @@ class Severity:
     Attributes
     ----------
     levels : tuple of float
-        The levels that the shipped suites use as rungs, from mild to severe.
+        Standard levels, from mild to severe. The shipped suites take their rungs from these levels.
     unit : str
         Unit of the levels.
     bounds : (float, float)

@@ -72,7 +72,7 @@ def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: floa
 
 
 def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
-    """Return the pixel coordinates of a polygon on the board; if the lens bends lines, cut the edges into short pieces."""
+    """Project a polygon on the board into the image; if the lens bends lines, the edges are cut into short pieces."""
     if not any(camera.distortion):
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm

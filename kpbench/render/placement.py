@@ -23,8 +23,9 @@ LARGEST_DEPTH_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges within which a random scene is drawn. The defaults are the ranges of the paper (§3.2), where the paper
-    gives a range.
+    """Ranges within which a random scene is drawn.
+
+    The default is the paper's range (§3.2), if the paper gives a range.
 
     Attributes
     ----------

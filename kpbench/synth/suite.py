@@ -85,7 +85,7 @@ class SuiteConfig:
     seed : int
         0 or more.
     size_px : (int, int) or None
-        Width and height; None for the suite's own. The horizontal field of view does not depend on ``size_px``.
+        Width and height; None for the suite's own size. The horizontal field of view does not depend on ``size_px``.
     only : tuple of str
         Names of the conditions to make; an empty tuple makes all conditions.
     backgrounds : Path or None

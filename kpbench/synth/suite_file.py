@@ -112,7 +112,7 @@ class Suite:
         Parameters
         ----------
         size_px : (int, int), optional
-            Width and height of the image. None: the suite's own.
+            Width and height of the image. None: the suite's own size.
         distortion : tuple of float
             Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; missing coefficients are 0.
         """

@@ -220,7 +220,7 @@ def training_batches(
     Raises
     ------
     DataError
-        If the photographs cannot be loaded, see :func:`load_photos`, or if a worker process dies.
+        If the photographs cannot be loaded (see :func:`load_photos`), or if a worker process dies.
     """
     _training_photos.cache_clear()
     return run_in_order(partial(_run_job, config, tuple(patches), folder, seed), jobs, workers)

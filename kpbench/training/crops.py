@@ -49,7 +49,7 @@ def empty_keypoints(count: int) -> Float32:
 
 
 class Disc(NamedTuple):
-    """A patch of a crop: its pose and inks, the index of its design, and its centre and semi-axes in px."""
+    """A patch of a crop: its placement, the index of its design, and its centre and semi-axes in px."""
 
     placement: Placement
     design: int
@@ -145,7 +145,7 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         if on_board:
             _draw_paper(image, rng, _poses_at(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    # centres may lie a little outside the crop; a patch whose centre is outside is no keypoint
+    # centres may lie a little outside the crop; a patch with its centre outside the crop gives no keypoint
     at = rng.uniform(-0.1, 1.1, (1 if on_board else count, 2)) * (width, height) - 0.5
     poses = _poses_at(rng, at, limits)
     if on_board:
@@ -201,7 +201,7 @@ def _poses_at(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
 
 
 def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
-    """Draw a sheet of paper in the plane of the patches: mostly light, sometimes of any grey level."""
+    """Draw a sheet of paper in the plane of the patches. The sheet is mostly light, and sometimes of any grey level."""
     grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
     low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
     corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T

@@ -110,7 +110,7 @@ def _cross_entropy(identity: Tensor, targets: Targets, config: LossConfig) -> Te
 
 
 def _hinge(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
-    """Return SuperPoint's descriptor loss (eq. 4 to 6 of its paper) between descriptors and a map of one-hot vectors.
+    """Return SuperPoint's descriptor loss (eq. 4 to 6 of the SuperPoint paper) between cells and one-hot vectors.
 
     The sum over pairs of cells is grouped by the class of the second cell. This is possible because the dot product of
     a normalised descriptor and a one-hot vector is one channel of the descriptor. The class of a cell is the design of

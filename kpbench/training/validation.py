@@ -1,4 +1,4 @@
-"""Validation: what a network finds in scenes that it is not trained on."""
+"""Validation: the keypoints that a network finds in scenes outside its training."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def make_validation_sets(
 
 @torch.inference_mode()
 def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, float]:
-    """Measure what a network finds, at the default threshold and without verification.
+    """Measure how many keypoints a network finds, at the default threshold and without verification.
 
     :func:`kpbench.score` cannot score crops, for two reasons. First, its tolerance ε is relative to the radius of a
     patch, and the keypoints of crops hold no radius. Second, crops have ignored keypoints; a detection near an ignored

@@ -1,4 +1,4 @@
-"""Initial weights: from a published file, an exported file or a checkpoint, also of a smaller network."""
+"""Initial weights from a published file, an exported file or a checkpoint; the network may grow from a smaller one."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def load_initial_weights(
     Returns
     -------
     str
-        One line that tells which weights were found.
+        One line that tells which weights were loaded.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
-        The state-dict. It may lack all BatchNorms, see :func:`restore_batchnorm`.
+        The state-dict. A state-dict without any BatchNorm is allowed, see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
@@ -245,7 +245,7 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     Returns
     -------
     str
-        A few words that tell what was done.
+        A few words that tell how many convolutions were added and left out.
 
     Raises
     ------

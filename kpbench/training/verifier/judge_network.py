@@ -1,4 +1,4 @@
-"""The network whose form both judges share."""
+"""The network of a judge; both judges have the same layers."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 from kpbench.types import Float, UInt8
 
 TRAINING_MARGIN = 1.0
-"""Training lowers the thresholds of the log odds for the second look and for the fit by this amount."""
+"""Amount by which training lowers the two thresholds of the log odds: for the second look and for the fit."""
 SPECKLED_EVERY = 3
 """One training image in this many has specks."""
 
@@ -49,7 +49,7 @@ class ImageLooks:
     candidate_right : ndarray of shape (n,), bool
         Whether each candidate is right.
     first_look, second_look : Hypotheses
-        Hypotheses as proposed, and hypotheses in the poses that the shipped first judge corrected at the first look.
+        Hypotheses in the proposed poses, and hypotheses in the poses that the shipped first judge corrected.
     shipped_log_odds : ndarray
         Log odds by the shipped first judge for the hypotheses of ``first_look``, followed by those of ``second_look``.
     """
@@ -95,7 +95,7 @@ def _unpack_judge(packed: bytes) -> Judge:
 def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
     """Return the hypotheses of one image at the two looks of the first judge.
 
-    The second look always admits hypotheses that are less likely than a detector admits.
+    The threshold for the second look is lower than in a detector, by ``TRAINING_MARGIN``.
 
     ``train`` : draw specks into one image in three.
     """

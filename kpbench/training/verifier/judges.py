@@ -1,9 +1,9 @@
 """Training of the two judges (:func:`kpbench.detectors.verification.judge`).
 
-Both judges have a small network of the same form. A hypothesis is right if its centre lies near a keypoint of its
-design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long semi-axes for the second
-judge, after the fit. Of several rotations of a design at one place, only the best rotation is right. Each judge also
-learns to correct the pose.
+Both judges are small networks with the same layers, but different widths. A hypothesis is right if its centre lies near
+a keypoint of its design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long
+semi-axes for the second judge, after the fit. Of several rotations of a design at one place, only the best rotation is
+right. Each judge also learns to correct the pose.
 
 The first judge is trained on the hypotheses of its first look and of its second look. For the second look, the shipped
 first judge corrects the poses, because the new judge does not exist yet. A hypothesis that the shipped first judge

@@ -29,7 +29,7 @@ def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
 
 
 def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
-    """Return whether each place (n, 2) px lies near its nearest keypoint and has the patch ID of that keypoint.
+    """Return whether each place (n, 2), px, lies near its nearest keypoint and has the patch ID of this keypoint.
 
     ``tolerance`` : largest distance, in long semi-axes of the keypoint.
     """
