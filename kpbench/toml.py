@@ -1,4 +1,4 @@
-"""Strict reading of TOML: an unknown key or a wrong value is an error that names the place and what was expected."""
+"""Strict reading of TOML: an unknown key or a wrong value raises an error that names the key and the expected value."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class Background:
     image : ndarray of shape (H, W) or (H, W, 3), uint8
         Grey or RGB.
     file : str
-        Path of the photograph below its folder; "" for a procedural background.
+        Path of the photograph, relative to its folder; "" for a procedural background.
     broken_files : tuple of str
         Files that were tried before ``file`` and could not be decoded.
     """
@@ -52,13 +52,13 @@ class Background:
 class PhotoFolder:
     """Photographs in a folder and in its subfolders, of any size and colour mode; some photographs may be broken.
 
-    Decoded photographs are kept in a cache of bounded size, which changes no result.
+    Decoded photographs are kept in a cache of bounded size. The cache changes no result.
 
     Attributes
     ----------
     path : Path
     files : tuple of str
-        Paths below ``path``, sorted so that the n-th file is the same on every machine.
+        Paths relative to ``path``, sorted so that the n-th file is the same on every machine.
 
     Examples
     --------

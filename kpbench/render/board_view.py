@@ -28,7 +28,7 @@ SHADOW_SHIFT = 0.4
 SHADOW_BLUR = 0.05
 """Standard deviation of the shadow's soft edge, in board sides."""
 SHADOW_GRID = 64
-"""Pixels per board side of the coarse grid on which the shadow is computed."""
+"""Resolution of the coarse grid on which the shadow is computed, grid pixels per board side."""
 RIM_POINTS = 720
 """Number of points on a disc's rim from which the moments of the disc's distorted image are computed."""
 

@@ -17,7 +17,7 @@ from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 WHOLLY_COVERED = 1 - 1e-6
-"""Least computed coverage of a pixel that lies wholly on a patch; the difference to 1 allows for rounding."""
+"""Least computed coverage of a pixel that lies wholly on a patch; the difference from 1 allows for rounding."""
 
 
 @dataclass(frozen=True)
@@ -210,8 +210,9 @@ def fraction_inside(image: UInt8, mask: Mask) -> float:
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """Measure the contrast of each patch in an image: white minus black.
 
-    A line, grey level against black fraction, is fitted by least squares to the pixels that lie wholly on the patch.
-    The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower it.
+    The grey level of the pixels that lie wholly on the patch is fitted by least squares as a line over the black
+    fraction. The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower
+    it.
 
     Parameters
     ----------

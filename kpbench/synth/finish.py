@@ -58,7 +58,7 @@ def augment_scene(
     placements : sequence of Placement
         The patches of the scene.
     effects : sequence of dict
-        Records of the effects that degraded the scene. Occlusions among them lower ``visible``.
+        Records of the effects that degraded the scene. Occlusions lower ``visible``.
     pipeline : str
         From :func:`kpbench.synth.load_augmentation`.
     seed : int

@@ -159,7 +159,7 @@ class SuiteConfig:
 
     @cached_property
     def rungs(self) -> tuple[tuple[Condition, int], ...]:
-        """Condition and position within the condition of every rung, in the order of the images."""
+        """Every rung as its condition and its position within the condition, in the order of the images."""
         chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
@@ -277,7 +277,7 @@ class SuiteConfig:
         -------
         sample : Sample
         broken_files : tuple of str
-            Background files that were drawn and could not be decoded.
+            Background files that were tried and could not be decoded.
         """
         view = self.view(index)
         background = self._find_background(view.scene_id)

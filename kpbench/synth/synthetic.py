@@ -163,7 +163,7 @@ class SynthConfig:
         -------
         sample : Sample
         broken_files : tuple of str
-            Background files that were drawn and could not be decoded.
+            Background files that were tried and could not be decoded.
         """
         width, height = self.size_px
         background = self._make_background(stream(self.seed, index, SYNTH_BACKGROUND))

@@ -1,6 +1,6 @@
 """Training samples, made on the fly. Seed and index determine the random numbers of a batch.
 
-There are two kinds of samples. Scenes are whole images, made as ``kpbench synth`` makes them. Crops
+There are two kinds of samples. Scenes are whole images, like the images of ``kpbench synth``. Crops
 (:mod:`kpbench.training.crops`) are small windows, degraded with a severity that the recipe sets.
 """
 

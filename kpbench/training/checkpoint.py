@@ -1,4 +1,7 @@
-"""State of a training, and checkpoints. A training resumed from a checkpoint gives the same weights, to the bit."""
+"""State of a training, and checkpoints.
+
+A resumed training ends in the same weights, to the bit, as an uninterrupted training.
+"""
 
 from __future__ import annotations
 

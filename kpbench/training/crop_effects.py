@@ -68,7 +68,7 @@ def degrade_crop(
 
 
 def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its gain."""
+    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its contrast factor."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:

@@ -211,7 +211,7 @@ def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
 
 
 def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
-    """Draw look-alikes at random places, and return the patches that are hidden by more than a third."""
+    """Draw look-alikes at random places, and return the patches of which more than a third is hidden."""
     before = image.copy()
     draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)

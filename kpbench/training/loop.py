@@ -89,13 +89,13 @@ def train(
 ) -> bool:
     """Train the detector's network, or resume a training.
 
-    Write ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
+    The checkpoint is ``checkpoint.safetensors``, the log is ``log.jsonl``.
 
     Parameters
     ----------
     recipe : Recipe
     out : path
-        The folder.
+        Folder for the checkpoint and the log.
     backgrounds : path, optional
         Folder of photographs; every tenth photograph is kept for validation. None: procedural textures.
     patches : sequence of Patch

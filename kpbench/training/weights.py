@@ -113,7 +113,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     Raises
     ------
     DataError
-        If the file cannot be read, or holds anything but named tensors.
+        If the file cannot be read, or is no dict of named tensors.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file

@@ -275,7 +275,7 @@ def calibrate_log_odds(network: EllipseNetwork, places: PlaceTensors) -> None:
 
 
 def _mirror(places: PlaceTensors) -> PlaceTensors:
-    """Mirror a batch in x, y or both, and exchange x and y, at random."""
+    """Mirror a batch at random in x, in y or in both, and exchange x and y at random."""
     surroundings, on, shift, log_map = places
     surroundings = surroundings.float()
     for axis in (0, 1):

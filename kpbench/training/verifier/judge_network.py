@@ -61,7 +61,7 @@ def input_tensors(hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Ten
 
 @torch.inference_mode()
 def apply_judge(network: Judge, hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Float, Hypotheses]:
-    """Judge hypotheses with a network in PyTorch, as :func:`kpbench.detectors.verification.judge` does in ONNX."""
+    """Judge hypotheses like :func:`kpbench.detectors.verification.judge`, but with a network in PyTorch."""
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     odds, shift, log_map = (part.numpy() for part in network(*input_tensors(hypotheses, patches)))
