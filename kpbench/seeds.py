@@ -1,15 +1,15 @@
-"""Seeds: every stage of every image has its own random numbers."""
+"""Seeds: every stage in the making of an image has its own random numbers."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# The pixels of every dataset depend on these numbers. A new stage gets a new number, and no number changes its meaning.
+# The pixels of every dataset depend on these numbers. A new stage gets a new number. No number may change its meaning.
 SYNTH_BACKGROUND, SYNTH_SCENE, SYNTH_DETERIORATION, SYNTH_LOOKALIKES, SYNTH_AUGMENTATION = range(5)
-"""Stages of an image of a synthetic set."""
+"""Stages in the making of an image of a synthetic set."""
 SUITE_BACKGROUND, SUITE_SCENE, SUITE_EFFECT, SUITE_FIELD = range(16, 20)
-"""Stages of a base scene of a suite. SUITE_SCENE draws pose, inks and light. SUITE_FIELD draws the random fields of the
-effects noise and low light."""
+"""Stages in the making of a base scene of a suite. SUITE_SCENE draws pose, inks and light. SUITE_FIELD draws the random
+fields of the effects noise and low light."""
 
 
 def stream(seed: int, index: int, stage: int) -> np.random.Generator:

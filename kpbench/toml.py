@@ -1,4 +1,4 @@
-"""Strict reading of TOML: an unknown key or a wrong value is an error that names the place and what was expected."""
+"""Strict reading of TOML: an unknown key or a wrong value raises an error that names the key and the expected value."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def name_source(source: str | Path, error: type[KpbenchError]) -> Iterator[None]
 class TomlTable:
     """A table whose keys are known.
 
-    A method returns the checked value of a key. If the table lacks the key, the method returns the default. A method
-    without a default raises an error.
+    A method returns the checked value of a key. If the table lacks the key, the method returns the default, or raises
+    an error if the method has no default.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class TomlTable:
         return self.error(f"{self.path(key)} is {value}, expected {expected}")
 
     def require_schema(self, schema: str, optional: bool = False) -> None:
-        """Raise an error unless the key ``schema`` holds this text. An optional key may be missing."""
+        """Raise an error unless the key ``schema`` holds the given text. If ``optional``, the key may be missing."""
         if self.values.get("schema", schema if optional else None) != schema:
             raise self.problem("schema", repr(schema))
 
@@ -102,7 +102,7 @@ class TomlTable:
         return value
 
     def flag(self, key: str) -> bool:
-        """Return true or false."""
+        """Return a value that is true or false."""
         value = self.values.get(key)
         if not isinstance(value, bool):
             raise self.problem(key, "true or false")
@@ -119,7 +119,7 @@ class TomlTable:
     def numbers(
         self, key: str, low: float, high: float = math.inf, count: int | None = None, whole: bool = False
     ) -> tuple[float, ...]:
-        """Return numbers from ``low`` to ``high``; ``count`` is the required number of numbers, None for any."""
+        """Return numbers from ``low`` to ``high``. If ``count`` is given, the list must have this length."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple) or count not in (None, len(value)):
             raise self.problem(key, f"a list of {'' if count is None else f'{count} '}numbers")

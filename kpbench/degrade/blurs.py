@@ -15,7 +15,7 @@ from kpbench.geometry.outline import arc_vertices
 from kpbench.types import Float, UInt8
 
 BORDER_MODE = cv2.BORDER_REFLECT_101
-"""Every kernel continues the image beyond the image's border, mirrored about the outermost pixel."""
+"""Border rule of all kernels: the image continues beyond its border, mirrored about the outermost pixel."""
 
 
 def blur(image: UInt8, kernel_px: float) -> UInt8:

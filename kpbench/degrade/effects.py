@@ -26,8 +26,8 @@ Effect = dict[str, Any]
 FLARE_GHOSTS = ((-0.4, 0.25, 0.10), (-0.8, 0.45, 0.06), (0.5, 0.15, 0.12))
 """Ghosts of a lens flare, three numbers per ghost.
 
-Position on the line from the image's centre (0) to the lamp (1). Radius as a fraction of the glow's reach. Intensity as
-a fraction of the glow's strength.
+The numbers are the position on the line from the image's centre (0) to the lamp (1), the radius as a fraction of the
+glow's reach, and the intensity as a fraction of the glow's strength.
 """
 
 
@@ -38,7 +38,7 @@ def _to_uint8(image: Any) -> UInt8:
 
 @lru_cache(maxsize=1)
 def _normal_quantiles() -> Float:
-    """Return 2¹⁶ equally likely values of the standard normal distribution, in ascending order, up to 4.3."""
+    """Return 2¹⁶ equally likely values of the standard normal distribution, in ascending order, from -4.3 to 4.3."""
     from scipy.special import ndtri
 
     values = ndtri((np.arange(2**16) + 0.5) / 2**16)
@@ -48,7 +48,7 @@ def _normal_quantiles() -> Float:
 def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     """Add Gaussian noise, then round and clip.
 
-    The paper's "kernel size from 15 to 60 pixels" is read as the standard deviation.
+    The paper's "kernel size from 15 to 60 pixels" is read as a standard deviation of 15 to 60 grey levels.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     >>> round(noise(flat, np.random.default_rng(0), sigma=15).std())
     15
     """
-    # pixels are whole numbers, so noise can be rounded before the addition: a uniform 16-bit number picks a rounded
+    # pixels are whole numbers, so noise can be rounded before the addition; a uniform 16-bit number picks a rounded
     # quantile, which is quicker than a normal generator
     levels = np.rint(sigma * _normal_quantiles()).astype(np.int16)
     field = levels[np.frombuffer(rng.bytes(2 * image.size), "<u2")].reshape(image.shape)
@@ -178,13 +178,13 @@ def shadow_edge(image: UInt8, x: float, y: float, angle_deg: float, light: float
 def rainfall(image: UInt8, seed: int, streaks: int, length_px: float, slant_deg: float) -> UInt8:
     """Draw bright streaks of falling drops over the image.
 
-    The paper's rain is :func:`rain`, whose strength is fixed. The strength of this effect is ``streaks``.
+    The paper's rain is :func:`rain`, whose strength is fixed. Here, ``streaks`` sets the strength.
 
     Parameters
     ----------
     image : ndarray of shape (H, W) or (H, W, 3), uint8
     seed : int
-        Seed of place, slant, length, width and opacity of each streak.
+        Seed of the place, slant, length, width and opacity of each streak.
     streaks : int
         Number of streaks.
     length_px : float

@@ -38,7 +38,7 @@ class Severity:
     Attributes
     ----------
     levels : tuple of float
-        The levels that are rungs of the suites, from mild to severe.
+        Standard levels, from mild to severe. The shipped suites take their rungs from these levels.
     unit : str
         Unit of the levels.
     bounds : (float, float)
@@ -253,7 +253,7 @@ def draw_ladder_mix(rng: np.random.Generator, size_px: tuple[int, int], discs: D
     effects = []
     for name in (LADDER_MIX[n] for n in sorted(chosen)):
         severity = LADDER[name]
-        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # falling levels: high is mild
+        harmless = severity.bounds[severity.levels[0] > severity.levels[-1]]  # the upper bound if the levels fall
         level = round(harmless + float(rng.random()) * (severity.levels[-1] - harmless), 0 if name == "jpeg" else 2)
         effects.append(draw_effect(rng, name, level, size_px, discs))
     return effects

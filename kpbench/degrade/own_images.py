@@ -18,7 +18,7 @@ from kpbench.writing import write_file
 
 
 def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
-    """Open an image, a folder of images or a video, to be degraded into a folder ``out``.
+    """Open an image, a folder of images or a video; the degraded images will be written to the folder ``out``.
 
     If ``out`` lies below the folder of the images, the images in ``out`` are left out.
 
@@ -50,7 +50,7 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
 def degrade_files(
     source: ImageSource, out: str | Path, steps: Sequence[tuple[str, float]], seed: int = 0
 ) -> Iterator[tuple[Path, list[Effect]]]:
-    """Degrade images one by one, and write each as PNG into ``out``, under its name and in its subfolder.
+    """Degrade images one by one, and write each as PNG into ``out``, with the name and subfolder of the image.
 
     A written image depends only on the image, the image's position in the source, the steps and the seed.
 

@@ -1,4 +1,4 @@
-"""Random shadow and random rain: the two effects of the paper that albumentations draws."""
+"""Random shadow and random rain: the two effects of the paper whose parameters albumentations draws."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from kpbench.types import UInt8
 def import_albumentations() -> Any:
     """Import albumentations and return the module.
 
-    The import is slow and is therefore made at the first use. The environment variable keeps the library from asking
-    the network for a newer version.
+    The import is slow and is therefore made at the first use. The environment variable stops albumentations from
+    looking online for a newer version.
     """
     os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
     import albumentations

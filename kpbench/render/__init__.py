@@ -1,6 +1,6 @@
-"""Patches before a background: a clean image and its truth.
+"""Rendering of patches in front of a background: a clean image and its truth.
 
-There are two kinds of scene: single patches in random poses (``render_scene``), and one board before a camera
+There are two kinds of scene: single patches in random poses (``render_scene``), and one board in front of a camera
 (``render_board``). Both functions paint by exact area coverage.
 """
 

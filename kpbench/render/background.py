@@ -38,9 +38,9 @@ class Background:
     image : ndarray of shape (H, W) or (H, W, 3), uint8
         Grey or RGB.
     file : str
-        Path of the photograph below its folder; "" for a procedural background.
+        Path of the photograph, relative to its folder; "" for a procedural background.
     broken_files : tuple of str
-        Files that were tried before and could not be decoded.
+        Files that were tried before ``file`` and could not be decoded.
     """
 
     image: UInt8
@@ -50,15 +50,15 @@ class Background:
 
 @dataclass
 class PhotoFolder:
-    """Photographs below a folder, of any size, mode and nesting; some of them may be broken.
+    """Photographs in a folder and in its subfolders, of any size and colour mode; some photographs may be broken.
 
-    Decoded photographs are kept in a cache of bounded size, which changes no result.
+    Decoded photographs are kept in a cache of bounded size. The cache changes no result.
 
     Attributes
     ----------
     path : Path
     files : tuple of str
-        Paths below ``path``, sorted so that the n-th file is the same on every machine.
+        Paths relative to ``path``, sorted so that the n-th file is the same on every machine.
 
     Examples
     --------
@@ -101,7 +101,7 @@ class PhotoFolder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the names and sizes of all files; it shows whether the folder has changed."""
+        """SHA-256 over the names and sizes of all files; a changed digest shows that the folder has changed."""
         listing = "\n".join(f"{name}\t{(self.path / name).stat().st_size}" for name in self.files)
         return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
@@ -228,7 +228,7 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
     """
     canvas = np.full((height_px, width_px, channels), round(rng.uniform(40, 215)), np.uint8)
     smallest, largest = LEAF_RADIUS
-    # the inverse of the radius' distribution function, truncated at the largest radius
+    # the inverse of the cumulative distribution of the radius, which is truncated at the largest radius
     radius_px = smallest * max(width_px, height_px) / np.sqrt(1 - rng.random(LEAVES) * (1 - (smallest / largest) ** 2))
     centre_px = rng.uniform(0, 1, (LEAVES, 2)) * (width_px, height_px)
     ratio, angle_deg = rng.uniform(0.3, 1.0, LEAVES), rng.uniform(0, 360, LEAVES)

@@ -1,6 +1,6 @@
 """Poses of a board, and the exact projection of a board into the image, with lens distortion.
 
-A pose is found for a given share of the image that the board covers, because the experiments fix this share.
+The share of the image that the board covers determines the board's distance, because the experiments fix this share.
 :mod:`kpbench.geometry` describes the frames.
 """
 
@@ -54,25 +54,25 @@ class Pose:
 
 
 def polygon_area(points: Float) -> float:
-    """Compute the area of a simple polygon with vertices of shape (n, 2), in either orientation."""
+    """Compute the area of a simple polygon with vertices of shape (n, 2), clockwise or counter-clockwise."""
     x, y = (points - points[0]).T
     return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
 
 
 def project_to_image(camera: Camera, pose: Pose, points_mm: Float) -> Float:
-    """Project points on the board, shape (n, 2), mm, into the image, shape (n, 2), px."""
+    """Return the pixel coordinates, shape (n, 2), of points on the board, shape (n, 2), mm."""
     return camera.project(np.column_stack([points_mm, np.ones(len(points_mm))]) @ pose.M_board2camera.T)
 
 
 def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: float = 0.0) -> Float:
-    """Project the board's outline, moved inwards by ``inset_mm``, into the image, shape (n, 2), px."""
+    """Return the pixel coordinates, shape (n, 2), of the board's outline, moved inwards by ``inset_mm``."""
     w, h = board.side_x_mm - 2 * inset_mm, board.side_y_mm - 2 * inset_mm
     corners = flatten(rectangle(-w / 2, -h / 2, w, h), 1.0)[0]
     return project_polygon(camera, pose, corners)
 
 
 def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
-    """Project a polygon on the board; its edges are cut into short pieces if the lens bends lines."""
+    """Project a polygon on the board into the image; if the lens bends lines, the edges are cut into short pieces."""
     if not any(camera.distortion):
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm
@@ -103,14 +103,16 @@ def pose_board(
     area_percent : float
         Projected area, percent of the image's pixels.
     pitch_deg : float
-        Tilt about the camera's x axis. A positive pitch leans the upper side away, as on a table.
+        Tilt about the camera's x axis. A positive pitch moves the board's upper side away from the camera, as if the
+        board lay on a table.
     yaw_deg : float
-        Tilt about the camera's y axis, after the pitch. A positive yaw leans the right side away.
+        Tilt about the camera's y axis, after the pitch. A positive yaw moves the board's right side away from the
+        camera.
     roll_deg : float
         Turn of the board in its own plane, before any tilt, from +x towards +y.
     shift : (float, float)
-        Offset of the board's centre from the image's centre, in image widths and heights, before lens distortion. A
-        board that would leave the image is moved towards the centre: to 0.8, 0.6, ... of the shift.
+        Offset of the board's centre from the image's centre, in image widths and heights, before lens distortion. If
+        the board would leave the image, the shift is reduced to 0.8, 0.6, 0.4, 0.2 or 0 times its value.
 
     Returns
     -------

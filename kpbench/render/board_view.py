@@ -1,4 +1,4 @@
-"""Views of a board before a camera: light, exact rendering, and the truth.
+"""Views of a board in front of a camera: light, exact rendering, and the truth.
 
 Ink and paper are projected as outlines and painted by exact area coverage. Even a board that covers 0.5 % of the image
 is therefore not aliased.
@@ -24,18 +24,18 @@ from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 EDGE_WIDTH = 0.008
 """Width of the band along the board's cut edge, in lengths of the board's shorter side."""
 SHADOW_SHIFT = 0.4
-"""Shift of the board's shadow for a slope of the light of 1, in board sides."""
+"""Shift of the board's shadow if the light has a slope of 1, in board sides."""
 SHADOW_BLUR = 0.05
 """Standard deviation of the shadow's soft edge, in board sides."""
 SHADOW_GRID = 64
-"""Pixels per board side of the coarse grid on which the shadow is computed."""
+"""Resolution of the coarse grid on which the shadow is computed, grid pixels per board side."""
 RIM_POINTS = 720
 """Number of points on a disc's rim from which the moments of the disc's distorted image are computed."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Inks and light of a board. A board side is the square root of the board's projected area.
+    """Inks and light of a board. The unit "board side" is the square root of the board's projected area.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Appearance:
         Change of brightness over one board side, to the right and downwards in the image. The light is
         clipped to [0, 1].
     shadow : float
-        Fraction of the light that the board takes from the scene behind it. The shadow has a soft edge and
+        Fraction of the light that the board takes from the scene behind the board. The shadow has a soft edge and
         falls away from the lamp, against the slope.
 
     Examples
@@ -110,7 +110,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
 
 
 def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
-    """Project evenly spaced points of the patch's unit circle into the image, shape (RIM_POINTS, 2), px."""
+    """Return the pixel coordinates, shape (RIM_POINTS, 2), of evenly spaced points of the patch's unit circle."""
     angles = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.ones(RIM_POINTS)])
     return camera.project(rim @ M_patch2camera.T)
@@ -133,7 +133,7 @@ def _ellipse_of_moments(points: Float) -> Ellipse:
 
 
 def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike, appearance: Appearance) -> Rendering:
-    """Paint a board before a background with exact area coverage.
+    """Paint a board in front of a background with exact area coverage.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: flo
 def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Appearance) -> None:
     """Darken the scene behind the board, in place.
 
-    The shadow is smooth, so that a coarse grid suffices: the shadow is computed on the grid and enlarged.
+    The shadow is smooth. A coarse grid therefore suffices: the shadow is computed on this grid and enlarged.
     """
     step = max(1, round(side_px / SHADOW_GRID))  # px per pixel of the coarse grid
     blur = SHADOW_BLUR * side_px / step

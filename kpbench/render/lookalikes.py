@@ -1,6 +1,6 @@
 """Look-alikes: shapes that a detector may mistake for a patch, such as discs, rings, chequers, text and half-patches.
 
-Look-alikes carry no label: a detector must not report them. OpenCV draws them, without exact edges.
+Look-alikes have no label: a detector must not report them. OpenCV draws them, without exact edges.
 """
 
 from __future__ import annotations

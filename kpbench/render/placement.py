@@ -23,7 +23,9 @@ LARGEST_DEPTH_CHANGE = 0.5
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges within which a random scene is drawn. Where the paper gives a range (§3.2), this range is the default.
+    """Ranges within which a random scene is drawn.
+
+    The default is the paper's range (§3.2), if the paper gives a range.
 
     Attributes
     ----------
@@ -34,11 +36,11 @@ class Limits:
     axis_difference : float
         Largest (major − minor) / major of a projected disc.
     radius_px : (float, float)
-        Smallest and largest radius of a disc before it is tilted, px; drawn log-uniformly.
+        Smallest and largest radius of a disc before the tilt, px; the radius is drawn log-uniformly.
     tilt_deg : float
-        Largest tilt about each of the two axes in the patch's plane, degrees; drawn independently.
+        Largest tilt about each of the two axes in the patch's plane, degrees; the two tilts are drawn independently.
     focal : (float, float)
-        Shortest and longest focal length, in image widths; drawn log-uniformly.
+        Shortest and longest focal length, in image widths; the focal length is drawn log-uniformly.
     black, white : (float, float)
         Ranges of the two inks, grey levels.
 
@@ -68,7 +70,7 @@ class Limits:
         if not 1 <= least <= most <= 4096:
             raise DataError(f"`radius_px` is {least:g}:{most:g}, expected px from 1 to 4096, the smaller first")
         if 2 * most < 1.2 * self.minor_axis_px:  # with smaller radii, hardly any tilt keeps the short axis long enough
-            expected = f"expected a largest of at least {0.6 * self.minor_axis_px:g}: no short axis is under"
+            expected = f"expected a largest radius of at least {0.6 * self.minor_axis_px:g}: short axes are at least"
             raise DataError(f"`radius_px` is {least:g}:{most:g}, {expected} {self.minor_axis_px:g} px")
 
     @classmethod
@@ -84,7 +86,7 @@ class Limits:
         Raises
         ------
         DataError
-            If the two are no range of radii, or if ``most_px`` is less than 1.2 times the least short semi-axis.
+            If the two values are no range of radii, or if ``most_px`` is less than 1.2 times the least short semi-axis.
 
         Examples
         --------
@@ -165,7 +167,7 @@ def random_placements(
         H_extent2image = poses * np.stack([extent, extent, np.ones(candidates)], axis=1)[:, None]
         centre, reach, _, _ = project_discs(H_extent2image)
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
-            # the wide rim of a steep patch may reach the horizon, and then projects to no ellipse
+            # if the rim of a steeply tilted patch reaches the horizon, its image is no ellipse
             has_ellipse = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
             is_free = all(math.hypot(x - x0, y - y0) > r + r0 + GAP_PX for x0, y0, r0 in circles)
             if len(placements) < count and has_ellipse and is_free:
@@ -219,8 +221,8 @@ def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, 
     """Compute the first two columns of ``K [r1 r2 t] / depth``, shape (n, 3, 3); the third column is not set.
 
     The depth is ``focal_px / radius_px``, in disc radii. The rotation is made as in
-    :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]`` about x,
-    in rad. (cx_px, cy_px) is the principal point.
+    :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]`` about x.
+    The angles are in rad. (cx_px, cy_px) is the principal point.
     """
     (cx, cy), (sx, sy), cz, sz = np.cos(tilt), np.sin(tilt), np.cos(turn), np.sin(turn)
     H = np.empty((len(turn), 3, 3))

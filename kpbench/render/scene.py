@@ -1,4 +1,4 @@
-"""Scenes of single patches: exact rendering before a background, and the true keypoints."""
+"""Scenes of single patches: exact rendering in front of a background, and the true keypoints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 WHOLLY_COVERED = 1 - 1e-6
-"""Least computed coverage of a pixel that lies wholly on a patch; the difference to 1 allows for rounding."""
+"""Least computed coverage of a pixel that lies wholly on a patch; the difference from 1 allows for rounding."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Mask:
     Attributes
     ----------
     box : Box
-        The part of the image that the two arrays cover; it may reach outside the image.
+        The rectangle of pixels that the two arrays cover; the rectangle may reach outside the image.
     black : ndarray of shape (height, width)
         Fraction of each pixel that black ink covers.
     disc : ndarray of shape (height, width)
@@ -210,8 +210,9 @@ def fraction_inside(image: UInt8, mask: Mask) -> float:
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """Measure the contrast of each patch in an image: white minus black.
 
-    A line is fitted by least squares to the pixels that lie wholly on the patch: grey level against black fraction.
-    The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower it.
+    The grey level of the pixels that lie wholly on the patch is fitted by least squares as a line over the black
+    fraction. The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower
+    it.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
         part = image[in_image]
         grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
         black = mask.black[in_box].ravel()
-        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # quicker than picking the pixels
+        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # quicker than a selection of pixels
         count = weight.sum()
         weighted = weight * black
         # sums, not @: a threaded BLAS costs more than it saves on so few pixels

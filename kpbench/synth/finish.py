@@ -18,7 +18,7 @@ from kpbench.types import Float, UInt8
 
 
 def discs_of(keypoints: NDArray[Any]) -> Float:
-    """Return x, y and radius (px) of each keypoint's patch, shape (n, 3), for effects that are aimed at patches."""
+    """Return x, y and radius (px) of each keypoint's patch, shape (n, 3), for effects that aim at patches."""
     return np.column_stack([keypoints[name] for name in ("x", "y", "radius_major")]).astype(np.float64)
 
 
@@ -58,7 +58,7 @@ def augment_scene(
     placements : sequence of Placement
         The patches of the scene.
     effects : sequence of dict
-        Records of the effects that degraded the scene. Occlusions among them lower ``visible``.
+        Records of the effects that degraded the scene. Occlusions lower ``visible``.
     pipeline : str
         From :func:`kpbench.synth.load_augmentation`.
     seed : int
@@ -92,7 +92,7 @@ def unoccluded_fraction(image: UInt8, effects: Sequence[Effect], masks: Sequence
     image : ndarray of shape (H, W) or (H, W, 3), uint8
         Parts of a patch outside this image do not count.
     effects : sequence of dict
-        Records of effects; only occlusions matter.
+        Records of effects; effects other than occlusions are ignored.
     masks : sequence of Mask
 
     Returns

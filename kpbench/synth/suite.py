@@ -1,9 +1,9 @@
 """Suites: the configuration that determines every image of a benchmark suite, and how one image is made.
 
-Image and truth are a function of the suite, the seed, the size, the lens and the background files.
+Image and truth depend only on the suite, the boards, the seed, the size, the lens and the background files.
 A base scene consists of background, pose, inks and light. Every base scene is shown with every patch under every
-rung. All images of a base scene share their ``scene_id`` and the random numbers of the effects. Comparisons are
-therefore paired.
+rung. All images of a base scene share their ``scene_id`` and the random numbers of the effects. Comparisons between
+patches or rungs are therefore paired.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ BOARD_SIDE_MM = 187.5
 
 @dataclass(frozen=True)
 class View:
-    """Everything that one image of a suite will show, before anything is painted.
+    """Everything that one image of a suite shows, except the background. Nothing is painted yet.
 
     Attributes
     ----------
@@ -81,11 +81,11 @@ class SuiteConfig:
     ----------
     suite : Suite
     images : int or None
-        Number of base scenes; None for the suite's own number. A smaller number gives the first base scenes.
+        Number of base scenes; None for the suite's own number. A smaller number makes only the first base scenes.
     seed : int
         0 or more.
     size_px : (int, int) or None
-        Width and height; None for the suite's own. The horizontal field of view does not depend on ``size_px``.
+        Width and height; None for the suite's own size. The horizontal field of view does not depend on ``size_px``.
     only : tuple of str
         Names of the conditions to make; an empty tuple makes all conditions.
     backgrounds : Path or None
@@ -159,7 +159,7 @@ class SuiteConfig:
 
     @cached_property
     def rungs(self) -> tuple[tuple[Condition, int], ...]:
-        """Condition and position within the condition of every rung, in the order of the images."""
+        """Every rung as its condition and its position within the condition, in the order of the images."""
         chosen = [c for c in self.suite.conditions if not self.only or c.name in self.only]
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
@@ -277,7 +277,7 @@ class SuiteConfig:
         -------
         sample : Sample
         broken_files : tuple of str
-            Background files that were drawn and could not be decoded.
+            Background files that were tried and could not be decoded.
         """
         view = self.view(index)
         background = self._find_background(view.scene_id)
@@ -298,7 +298,7 @@ class SuiteConfig:
     def _find_background(self, scene_id: int) -> Background:
         """Return the background of a base scene from the cache, or make the background.
 
-        Every base scene returns under every rung. The cache holds as many backgrounds as a shard has images.
+        A base scene is used again under every rung. The cache holds as many backgrounds as a shard has images.
         """
         if scene_id in self._background_cache:
             return self._background_cache[scene_id]

@@ -33,7 +33,7 @@ SCENE_KEYS = {
 }
 """Quantities that are drawn for a scene, and the range of values that a suite may set for each quantity.
 
-:func:`kpbench.render.pose_board` explains the pose, :class:`kpbench.render.Appearance` the inks and the light.
+:func:`kpbench.render.pose_board` explains the pose. :class:`kpbench.render.Appearance` explains the inks and the light.
 """
 
 Levels = tuple[tuple[str, tuple[float, ...]], ...]
@@ -112,7 +112,7 @@ class Suite:
         Parameters
         ----------
         size_px : (int, int), optional
-            Width and height of the image. None: the suite's own.
+            Width and height of the image. None: the suite's own size.
         distortion : tuple of float
             Up to five of OpenCV's coefficients k1, k2, p1, p2, k3; missing coefficients are 0.
         """

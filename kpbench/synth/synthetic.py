@@ -143,7 +143,7 @@ class SynthConfig:
 
     @property
     def image_bytes(self) -> int:
-        """Expected size of one image on disk: photographs deflate to about two thirds, noise hardly at all."""
+        """Expected size of one image on disk: photographs shrink to about two thirds, noise hardly shrinks."""
         width, height = self.size_px
         return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
 
@@ -163,7 +163,7 @@ class SynthConfig:
         -------
         sample : Sample
         broken_files : tuple of str
-            Background files that were drawn and could not be decoded.
+            Background files that were tried and could not be decoded.
         """
         width, height = self.size_px
         background = self._make_background(stream(self.seed, index, SYNTH_BACKGROUND))

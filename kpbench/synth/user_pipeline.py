@@ -27,7 +27,7 @@ from kpbench.render.placement import Placement
 from kpbench.types import UInt8
 
 LEAST_IMAGE_SHARE = 0.999
-"""Least fraction of a pixel that must come from the image; the transform fills in the rest."""
+"""Least fraction of a pixel that must come from the original image; the transform fills the rest of the pixel."""
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
@@ -71,7 +71,7 @@ def load_augmentation(path: str | Path) -> str:
 
 
 def _parse_yaml(text: str) -> Any:
-    import yaml  # type: ignore[import-untyped]  # albumentations requires it
+    import yaml  # type: ignore[import-untyped]  # albumentations requires yaml
 
     return yaml.safe_load(text)
 

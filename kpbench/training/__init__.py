@@ -1,4 +1,4 @@
-"""Training of the detector's network by a recipe, and of the three networks that verify its candidates.
+"""Training of the detector's network by a recipe, and of the three networks that verify the detector's candidates.
 
 Recipes and training samples need no further package. Everything else needs ``pip install 'kpbench[train]'``.
 """

@@ -1,6 +1,6 @@
-"""Training samples, made on the fly. A batch is a function of configuration, seed and index.
+"""Training samples, made on the fly. Seed and index determine the random numbers of a batch.
 
-There are two kinds of samples. Scenes are whole images, made as ``kpbench synth`` makes them. Crops
+There are two kinds of samples. Scenes are whole images, like the images of ``kpbench synth``. Crops
 (:mod:`kpbench.training.crops`) are small windows, degraded with a severity that the recipe sets.
 """
 
@@ -31,12 +31,12 @@ VALIDATION_EVERY = 10
 PHOTO_PX = 640
 """Larger photographs are shrunk to this long side, px."""
 LEAST_PHOTO_PX = 8
-"""Photographs with a shorter short side after shrinking, px, are left out."""
+"""Smallest short side of a photograph after shrinking, px; narrower photographs are left out."""
 
 
 @dataclass(frozen=True)
 class SampleConfig:
-    """Kind, size and number of the samples of a training.
+    """Kind and size of the training samples, and number of different scenes.
 
     Attributes
     ----------
@@ -94,21 +94,23 @@ class Batch(NamedTuple):
 
 
 def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
-    """Load one part of the photographs of a folder in grey, in the order of their names.
+    """Load the training photographs or the validation photographs of a folder, in grey, sorted by path.
 
-    Photographs are shrunk to at most 640 px. Broken and very narrow photographs are left out.
+    Photographs are shrunk to a long side of at most 640 px. Broken photographs, and photographs with a short side under
+    8 px, are left out.
 
     Parameters
     ----------
     folder : path or None
         None: 64 procedural textures stand in for the photographs.
     part : str
-        "validation" (every tenth photograph) or "training" (the others). A single photograph belongs to both.
+        "validation" (every tenth photograph) or "training" (the others). If the folder holds only one photograph, the
+        photograph belongs to both parts.
 
     Raises
     ------
     DataError
-        If the folder holds no photographs, or none of the part can be decoded.
+        If the folder holds no photographs, or no photograph of the part can be used.
 
     Examples
     --------
@@ -161,12 +163,12 @@ def make_batch(
     photos : sequence of ndarray of shape (H, W), uint8
         Backgrounds, see :func:`load_photos`.
     seed, index : int
-        The samples are a function of both.
+        Seed of the training, and index of the batch.
     count : int
         Number of samples.
     severity : float
         From 0 to 1. For crops: severity of the degradations; at 0, only slight blur and noise remain. For scenes:
-        share of the scenes that are degraded.
+        probability that a scene is degraded.
 
     Examples
     --------
@@ -200,7 +202,7 @@ def training_batches(
     jobs: Iterable[BatchJob],
     workers: int,
 ) -> Iterator[Batch]:
-    """Yield training batches in the order of their jobs; worker processes make the batches ahead.
+    """Yield training batches in the order of their jobs; worker processes make the batches in advance.
 
     The worker processes are spawned, not forked, so that they load neither torch nor its threads.
 
@@ -218,7 +220,7 @@ def training_batches(
     Raises
     ------
     DataError
-        If the photographs cannot be loaded, see :func:`load_photos`, or if a worker process dies.
+        If the photographs cannot be loaded (see :func:`load_photos`), or if a worker process dies.
     """
     _training_photos.cache_clear()
     return run_in_order(partial(_run_job, config, tuple(patches), folder, seed), jobs, workers)

@@ -1,4 +1,7 @@
-"""State of a training, and checkpoints. A training resumed from a checkpoint gives the same weights, to the bit."""
+"""State of a training, and checkpoints.
+
+A resumed training ends in the same weights, to the bit, as an uninterrupted training.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,7 @@ SCHEMA = "kpbench.checkpoint/1"
 
 @dataclass
 class TrainingState:
-    """All that changes during a training.
+    """State of a training between two steps.
 
     Attributes
     ----------
@@ -38,7 +41,7 @@ class TrainingState:
     step : int
         Number of completed steps.
     seconds : float
-        Time that the completed steps took, s.
+        Duration of the training so far, s.
 
     Examples
     --------
@@ -82,12 +85,12 @@ def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
 
 
 def digest_designs(patches: Sequence[Patch]) -> str:
-    """Return the SHA-256 of the designs, in the order of the channels of the ID head."""
+    """Return one SHA-256 of all designs; the designs are in the order of the channels of the ID head."""
     return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
 
 
 def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
-    """Write a state to one safetensors file, whole or not at all."""
+    """Write a state to one safetensors file. An interruption leaves no partial file."""
     from safetensors.torch import save
 
     tensors = {f"network.{k}": v for k, v in state.network.state_dict().items()}
@@ -114,7 +117,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     Raises
     ------
     DataError
-        If the file is no checkpoint of this schema.
+        If the file cannot be read, or is no checkpoint of this schema.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -130,12 +133,12 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
 
 
 def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
-    """Load a checkpoint into a state from :func:`start_state`.
+    """Load a checkpoint into a state that :func:`start_state` returned.
 
     Raises
     ------
     DataError
-        If the file is no checkpoint, or it belongs to another recipe or to other designs.
+        If the file is no checkpoint, or was written with another recipe or other designs.
     """
     content, tensors = read_checkpoint(path)
     theirs = parse_recipe(content["recipe"], str(path))
@@ -163,7 +166,7 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
 
 
 def load_mean_network(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
-    """Return the running mean of a checkpoint as a network in evaluation mode."""
+    """Return a network, in evaluation mode, with the running mean of a checkpoint's weights."""
     network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
     network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
     return network.eval()

@@ -13,21 +13,21 @@ from kpbench.types import Float32, UInt8
 def degrade_crop(
     image: UInt8, rng: np.random.Generator, severity: float, radius: float
 ) -> tuple[UInt8, float, float, float]:
-    """Degrade a crop by light, rain, blur, noise and compression.
+    """Degrade a crop at random: change the light, add rain, blur and noise, and compress.
 
-    ``severity`` : from 0 to 1. ``radius`` : short semi-axis of the smallest patch, px; it limits the blur.
+    ``severity`` : from 0 to 1. ``radius`` : short semi-axis of the smallest patch, px; the radius limits the blur.
 
     Returns
     -------
     image : ndarray of shape (H, W), uint8
     gain : float
-        Estimated ratio of the contrast after to the contrast before, where the contrast falls most.
+        Estimated factor by which the contrast changes, where the contrast falls most.
     kernel : float
         Width of the blur, px; 0: no blur.
     sigma : float
         Estimated standard deviation of the noise, grey levels.
     """
-    gain, kernel, sigma = 1.0, 0.0, 0.6  # 0.6: noise of rounding and of a good sensor
+    gain, kernel, sigma = 1.0, 0.0, 0.6  # 0.6 grey levels: noise of rounding and of a good sensor
     work = image.astype(np.float32)
     if rng.random() < 0.3 * severity:
         work, factor = _draw_shadow(work, rng)
@@ -39,7 +39,7 @@ def degrade_crop(
     if rng.random() < 0.6 * severity + 0.2:
         work, kernel = _blur(work, rng, severity, radius)
     draw = rng.random()
-    if draw < 0.35 * severity:  # the strongest dimming of the benchmark has the factor 0.6^4
+    if draw < 0.35 * severity:  # the severest rung of the effect dimming has the factor 0.6^4
         factor = 0.6 ** rng.uniform(0.0, 4.3)
         work *= np.float32(factor)
         gain *= factor
@@ -68,7 +68,7 @@ def degrade_crop(
 
 
 def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its gain."""
+    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its contrast factor."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:

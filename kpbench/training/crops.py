@@ -1,7 +1,7 @@
-"""Training crops: small windows with patches, boards of patches and look-alikes, made a batch at a time.
+"""Training crops: small windows with patches, boards of patches and look-alikes. One call makes a batch.
 
-One core makes several hundred crops per second. A keypoint that blur or noise has buried is marked as ignored: the
-network learns neither to report such a keypoint nor to suppress it.
+One core makes several hundred crops per second. A keypoint that blur or noise hides is marked as ignored: the network
+learns neither to report nor to suppress this keypoint.
 """
 
 from __future__ import annotations
@@ -24,28 +24,32 @@ from kpbench.types import Float, Float32, UInt8
 MOST_KEYPOINTS = 12
 """Rows of keypoints per sample; further keypoints of a sample are left out."""
 IMAGE_PX = (640, 480)
-"""Width and height of the imagined whole image, px; focal lengths are drawn relative to this width."""
+"""Width and height of the whole image, px. A crop is a part of this image; focal lengths are drawn relative to the
+width of this image."""
 ZOOM = (0.35, 3.0)
 """Range of the scale of a background, px of the photograph per px of the crop."""
 VIEW_SCALES = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
-"""Scale of the image in a crop → share of the crops with this scale."""
+"""Factor by which a crop is resized after drawing → share of the crops with this factor."""
 ENLARGED_RADIUS_PX = (4.0, 40.0)
-"""Range of the radii in enlarged crops, px before the enlargement; the other scales cover larger patches."""
+"""Range of the radii of patches in enlarged crops, px before the enlargement. Other crops use the default range of
+:class:`kpbench.render.Limits`."""
 LEAST_SIGNAL = 12.0
-"""Least contrast · √area / noise of a keypoint to be found. A matched filter then gives a signal of 6 sigmas."""
+"""Least contrast · √area / noise; keypoints with a lower value are ignored. At this value, the output of a matched
+filter is 6 standard deviations of the noise."""
 LEAST_KEYPOINT_CONTRAST = 4.0
-"""Least contrast of a keypoint to be found, grey levels. Rounding to 8 bits destroys most of a weaker pattern."""
+"""Least contrast, grey levels; keypoints with a lower contrast are ignored. Rounding to 8 bits destroys most of a
+weaker pattern."""
 
 
 def empty_keypoints(count: int) -> Float32:
-    """Return the rows (count, MOST_KEYPOINTS, 4) of samples without keypoints."""
+    """Return rows (count, MOST_KEYPOINTS, 4) that hold no keypoint."""
     keypoints = np.zeros((count, MOST_KEYPOINTS, 4), np.float32)
     keypoints[..., 2] = -1
     return keypoints
 
 
 class Disc(NamedTuple):
-    """A patch of a crop: its pose and inks, the index of its design, and its centre and semi-axes in px."""
+    """A patch of a crop: its placement, the index of its design, and its centre and semi-axes in px."""
 
     placement: Placement
     design: int
@@ -102,8 +106,8 @@ def cut_window(
 ) -> UInt8:
     """Cut a random window out of a photograph, resize the window, and mirror it with probability 0.5.
 
-    ``zoom`` : range of px of the photograph per px of the result. None: from half of the largest possible zoom to the
-    largest possible zoom.
+    ``zoom`` : range of the scale, px of the photograph per px of the result. None: from half of the largest possible
+    scale to the largest possible scale.
     """
     rows, columns = photo.shape
     largest = min(columns / width, rows / height)
@@ -117,7 +121,7 @@ def cut_window(
 
 
 def _draw_background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
-    """Draw a background: a window of a photograph, half of the time with changed contrast; rarely an even grey."""
+    """Draw a background: mostly a window of a photograph, half of these with changed contrast; rarely an even grey."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
     image = cut_window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
@@ -133,7 +137,7 @@ def _contains(image: UInt8, x: float, y: float) -> bool:
 
 
 def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UInt8, limits: Limits) -> list[Disc]:
-    """Return the patches of one crop; half of the time, draw a sheet of paper under the patches."""
+    """Return the patches of one crop. In half of the crops, draw a sheet of paper under the patches."""
     height, width = image.shape
     on_board = rng.random() < 0.5
     count = int(rng.choice(5, p=(0.15, 0.3, 0.22, 0.18, 0.15)))
@@ -141,14 +145,14 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         if on_board:
             _draw_paper(image, rng, _poses_at(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    # centres may lie a little outside the crop; a patch whose centre is outside is no keypoint
+    # centres may lie a little outside the crop; a patch with its centre outside the crop gives no keypoint
     at = rng.uniform(-0.1, 1.1, (1 if on_board else count, 2)) * (width, height) - 0.5
     poses = _poses_at(rng, at, limits)
     if on_board:
         first = poses[0]
         _draw_paper(image, rng, first)
-        # a hexagon board of side S has the circumradius 0.36 S and patches of radius 0.08 S, so 4.5 radii; other
-        # boards are tighter or looser
+        # the patches of a hexagon board of side S have the radius 0.08 S and lie on a circle of radius 0.36 S, which
+        # is 4.5 patch radii; on other boards, the patches lie closer together or further apart
         ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
         corners = turn + np.arange(6) * np.pi / 3
         offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array(
@@ -197,7 +201,7 @@ def _poses_at(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
 
 
 def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
-    """Draw a sheet of paper in the plane of the patches: mostly light, sometimes of any grey level."""
+    """Draw a sheet of paper in the plane of the patches. The sheet is mostly light, and sometimes of any grey level."""
     grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
     low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
     corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T
@@ -207,7 +211,7 @@ def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
 
 
 def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
-    """Draw look-alikes at random places, and return the patches that are hidden by more than a third."""
+    """Draw look-alikes at random places, and return the patches of which more than a third is hidden."""
     before = image.copy()
     draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)
@@ -223,7 +227,7 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patc
 def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
     """Draw the patches of a whole batch with one call of the rasteriser."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
-    # an edge error of 1/64 px is far below the noise; the finer edges of a benchmark image take longer
+    # an edge error of 1/64 px is far below the noise; edges as fine as in benchmark images would take longer
     masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
         paint_patch(image, mask, placement.black, placement.white)

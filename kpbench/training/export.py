@@ -1,4 +1,7 @@
-"""Export of a trained network as one ONNX file. Batches may have any size, images any multiple of 8 px."""
+"""Export of a trained network as one ONNX file.
+
+The file takes any number of images whose sides are multiples of 8 px.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +25,14 @@ from kpbench.training.network import SuperPoint
 from kpbench.writing import require_writable, write_file
 
 OPSET = 17
-"""Version of the ONNX operators."""
+"""Version of the ONNX operator set."""
 MOST_DIFFERENCE = 1e-4
 """Largest allowed difference between a logit of PyTorch and the same logit of ONNX Runtime."""
 
 
 @dataclass(frozen=True)
 class Exported:
-    """Facts about a file of :func:`export_onnx` or :func:`kpbench.training.export_int8`.
+    """Facts about a file that :func:`export_onnx` or :func:`kpbench.training.export_int8` wrote.
 
     Attributes
     ----------
@@ -93,14 +96,14 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
 
 
 def require_onnx_target(out: str | Path) -> None:
-    """Refuse a path that no ONNX file can be written to, before the work is done."""
+    """Raise an error if no ONNX file can be written to a path; call this function before the work starts."""
     if Path(out).suffix != ".onnx":
         raise DataError(f"{out}: expected a name ending in .onnx")
     require_writable(Path(out), "superpoint")
 
 
 def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
-    """Write the running mean of a checkpoint as an ONNX file, after a comparison of its outputs with PyTorch.
+    """Write the running mean of a checkpoint as an ONNX file, if ONNX Runtime and PyTorch give the same logits to 1e-4.
 
     Parameters
     ----------

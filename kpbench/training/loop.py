@@ -48,17 +48,18 @@ class TrainOptions:
     resume : bool
         Resume from the checkpoint in the output folder.
     minutes : float, optional
-        Stop after this time; the training can be resumed later.
+        Minutes after which the training stops; the training can be resumed later.
     workers : int
-        Processes that make samples; 0: this process makes them.
+        Number of processes that make samples; 0: the training process makes the samples.
     threads : int, optional
-        Threads of PyTorch; None: as PyTorch chooses.
+        Number of threads of PyTorch; None: PyTorch chooses.
     validate_every : float
         Minutes between validations.
     validation_images : int
-        Whole images per validation set of whole images; the set of crops has eight times as many crops.
+        Number of images in each validation set of whole images. The validation set of crops has eight times this
+        number.
     tensorboard : bool
-        Write the log for TensorBoard too.
+        Also write the log in TensorBoard's format.
 
     Examples
     --------
@@ -88,15 +89,15 @@ def train(
 ) -> bool:
     """Train the detector's network, or resume a training.
 
-    Write ``checkpoint.safetensors`` and ``log.jsonl`` into a folder.
+    The checkpoint is ``checkpoint.safetensors``, the log is ``log.jsonl``.
 
     Parameters
     ----------
     recipe : Recipe
     out : path
-        The folder.
+        Folder for the checkpoint and the log.
     backgrounds : path, optional
-        Folder of photographs; every tenth is kept for validation. None: procedural textures.
+        Folder of photographs; every tenth photograph is kept for validation. None: procedural textures.
     patches : sequence of Patch
         The designs, one per channel of the ID head.
     options : TrainOptions
@@ -111,9 +112,9 @@ def train(
     Raises
     ------
     DataError
-        If recipe, designs, checkpoint, folder or initial weights do not fit.
+        If recipe, designs, checkpoint, folder or initial weights do not fit together, or cannot be read.
     KeyboardInterrupt
-        If a signal ended the training. The checkpoint is written before.
+        If a signal ended the training. The checkpoint is written before this exception is raised.
 
     Examples
     --------
@@ -178,7 +179,10 @@ class _Training:
         return state
 
     def run(self, state: TrainingState, signalled: Callable[[], bool]) -> None:
-        """Train until the recipe is finished, the time is over or a signal came; save, validate and log regularly."""
+        """Train until the recipe is finished, the time limit is reached or a signal comes.
+
+        Checkpoints, validations and lines of the log are made regularly.
+        """
         group, options, leads = self.group, self.options, self.group.rank == 0
         validation = self.make_validation() if leads else []
         forward: nn.Module = torch.compile(state.network) if self.recipe.compile else state.network  # type: ignore[assignment]
@@ -215,7 +219,7 @@ class _Training:
                     break
 
     def make_validation(self) -> ValidationSets:
-        """Return the validation sets; their backgrounds are photographs that the training does not use."""
+        """Return the validation sets; their backgrounds are the validation photographs."""
         photos = load_photos(self.backgrounds, "validation")
         return make_validation_sets(self.recipe, self.designs, photos, self.options.validation_images)
 
@@ -232,7 +236,7 @@ class _Training:
 
 @contextmanager
 def _signals_seen() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM, so that the current step ends; yield a function that tells whether a signal came."""
+    """Catch Ctrl-C and SIGTERM, so that the current step can end; yield a function that tells whether a signal came."""
     seen = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield seen.is_set

@@ -1,4 +1,4 @@
-"""Targets of the network, and the losses of its outputs against the targets."""
+"""Targets of the network, and the losses between the network's outputs and the targets."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class Targets:
     identity : Tensor of shape (B, h, w), int64
         Index of the design, or ``ids`` for "no patch".
     near, far : Tensor of shape (B, h, w), bool
-        Whether the centre of the cell lies within 8 px of a keypoint, and whether it lies further than 16 px from all
-        keypoints. Ignored keypoints do not count, but cells near ignored keypoints are not ``far``.
+        ``near``: whether the centre of the cell lies within 8 px of a keypoint that must be found. ``far``: whether the
+        centre lies further than 16 px from all these keypoints and is not near an ignored keypoint.
     """
 
     place: Tensor
@@ -110,10 +110,11 @@ def _cross_entropy(identity: Tensor, targets: Targets, config: LossConfig) -> Te
 
 
 def _hinge(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
-    """Return SuperPoint's descriptor loss (eq. 4 to 6 of its paper) of an image against a map of one-hot vectors.
+    """Return SuperPoint's descriptor loss (eq. 4 to 6 of the SuperPoint paper) between cells and one-hot vectors.
 
-    The sum over pairs of cells is grouped by the class of the second cell: the dot product with a one-hot vector is
-    one channel of the normalised descriptor. The class of a cell is the design of its keypoint, or "no patch".
+    The sum over pairs of cells is grouped by the class of the second cell. This is possible because the dot product of
+    a normalised descriptor and a one-hot vector is one channel of the descriptor. The class of a cell is the design of
+    its keypoint, or "no patch".
     """
     has_keypoint = targets.place[:, -1] < 1
     classes = torch.where(has_keypoint, targets.identity, identity.shape[1] - 1)

@@ -5,8 +5,8 @@ cell, row by row, and one for "no keypoint". The descriptor head ends in an atta
 and one for "no patch". ``forward`` returns logits; :func:`kpbench.detectors.decode` turns them into keypoints outside
 of the exported graph.
 
-The parts have the names of the MIT re-implementation (rpautrat/SuperPoint, ``superpoint_pytorch.py``), so that its
-published weights can be loaded: ``backbone.<stage>.<n>.conv|bn``, ``detector.<n>``, ``descriptor.<n>``.
+The parts have the names of the MIT-licensed re-implementation (rpautrat/SuperPoint, ``superpoint_pytorch.py``), so that
+its published weights can be loaded: ``backbone.<stage>.<n>.conv|bn``, ``detector.<n>``, ``descriptor.<n>``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class SuperPoint(nn.Module):
         return nn.Sequential(conv_block(c_in, width, 3, norm), conv_block(width, c_out, 1, norm, relu=False))
 
     def _initialise(self) -> None:
-        """Set Kaiming weights, and set biases to the prior. Training from scratch does not start without the prior."""
+        """Set Kaiming weights, and biases that give the prior. Without the prior, random weights do not learn."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
@@ -100,7 +100,7 @@ class SuperPoint(nn.Module):
 
     @property
     def attached(self) -> list[nn.Parameter]:
-        """Parameters of the two attached layers. The paper at first trains only these layers."""
+        """Parameters of the two attached layers. The first phase of the paper's training trains only these layers."""
         return [*self.detector_attached.parameters(), *self.descriptor_attached.parameters()]
 
     def forward(self, image: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The processes that train one network together: a single process, or all processes of ``torchrun``."""
+"""The processes that train one network together: all processes of ``torchrun``, or a single process."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class ProcessGroup:
     device: torch.device
 
     def any_of(self, flag: bool) -> bool:
-        """Return whether the flag is true in any process; all processes must call this at the same step."""
+        """Return whether the flag is true in any process; all processes must call this method at the same step."""
         if self.size == 1:
             return flag
         total = torch.tensor(float(flag), device=self.device)

@@ -1,4 +1,4 @@
-"""Networks in 8-bit integers."""
+"""Conversion of networks to 8-bit integers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from kpbench.writing import write_file
 
 
 def export_int8(model: str | Path, out: str | Path) -> Exported:
-    """Write an exported network again in 8-bit integers: a quarter of the size, three times as fast on a processor.
+    """Convert an exported network to 8-bit integers: a quarter of the size, and three times as fast on a processor.
 
     The ranges of the activations are measured on 40 synthetic scenes over procedural backgrounds, at the detector's
     image scales. About half of the scenes are degraded.
@@ -101,7 +101,7 @@ def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "int8.onnx"
-        logging.disable(logging.WARNING)  # silences hints at a preprocessing that convolutions do not need
+        logging.disable(logging.WARNING)  # hides advice to preprocess the model, which convolutions do not need
         try:
             quantize_static(
                 model,

@@ -73,12 +73,12 @@ class LossConfig:
     positive_weight : float
         Weight of a cell with a keypoint, relative to a cell without a keypoint.
     focal : float
-        Exponent of the focal factor, by which the detector loss of well-predicted cells weighs less (Lin et al., *Focal
-        loss for dense object detection*, ICCV 2017); 0: no focal factor.
+        Exponent of the focal factor, which lowers the weight of well-predicted cells in the detector loss (Lin et al.,
+        *Focal loss for dense object detection*, ICCV 2017); 0: no focal factor.
     identity : str
         "entropy": cross-entropy over designs and "no patch", at cells within 8 px of a keypoint and at cells more than
-        16 px from all keypoints. "hinge": SuperPoint's descriptor loss against the one-hot map of all cells; cells of
-        one class are not negatives of each other.
+        16 px from all keypoints. "hinge": SuperPoint's descriptor loss between all cells and their one-hot map. Two
+        cells of the same class are never a negative pair.
     identity_weight : float
         Weight of the identity loss.
     lambda_d, positive_margin, negative_margin : float
@@ -103,7 +103,7 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of the training.
+    """A part of a training, with its own trained layers and its own severity.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Recipe:
     batch : int
         Samples per step, over all processes.
     optimizer : str
-        "adam" (weight decay as L2, as in the paper) or "adamw".
+        "adam" (weight decay as an L2 penalty, as in the paper) or "adamw".
     lr, weight_decay : float
         Learning rate and weight decay.
     warmup : int
@@ -150,13 +150,14 @@ class Recipe:
         "step" (the learning rate is multiplied by ``decay`` at each entry of ``decay_at``) or "cosine" (the learning
         rate falls from ``lr`` to ``decay`` · ``lr``, along half a cosine).
     decay : float
+        Factor of the learning rate, see ``schedule``.
     decay_at : tuple of int
-        Positions in the training, samples.
+        Positions in the training, in samples.
     ema : float
         Decay per step of the running mean of the weights; the running mean is validated and exported.
     precision : str
-        "fp32", or "bf16" (autocast): twice as fast on a GPU or a processor with AMX or AVX512-BF16, far slower on
-        other processors.
+        "fp32" or "bf16" (autocast). "bf16" is twice as fast on a GPU or on a processor with AMX or AVX512-BF16, but far
+        slower on other processors.
     compile : bool
         Whether ``torch.compile`` is used.
 
@@ -197,7 +198,7 @@ class Recipe:
         if not self.phases or min(p.samples for p in self.phases) < 1 or self.batch < 1:
             raise DataError("phases and batch: expected at least one phase, of at least one sample, and a batch from 1")
         if not self.steps:
-            raise DataError(f"phases: all have fewer samples than one batch, expected at least {self.batch}")
+            raise DataError(f"phases: together, they have fewer samples than one batch, expected at least {self.batch}")
 
     @property
     def steps(self) -> int:
@@ -205,7 +206,7 @@ class Recipe:
         return sum(p.samples for p in self.phases) // self.batch
 
     def phase(self, step: int) -> tuple[Phase, float]:
-        """Return the phase at a step, and the severity of degradations there."""
+        """Return the phase at a step, and the severity of the degradations at this step."""
         at = step * self.batch
         for phase in self.phases[:-1]:
             if at < phase.samples:
@@ -239,12 +240,12 @@ CHOICES = {  # key → its allowed values
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return the files of the recipes that ship with kpbench, by the recipes' names."""
+    """Return the files of the recipes that ship with kpbench, keyed by the file name without its suffix."""
     return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.toml"))}
 
 
 def load_recipe(name: str | Path) -> Recipe:
-    """Read a training recipe, given the name of a shipped recipe or the path of a TOML file.
+    """Read a training recipe, given a key of :func:`shipped_recipes` or the path of a TOML file.
 
     Raises
     ------

@@ -22,7 +22,10 @@ Record = Callable[[TrainingState, Mapping[str, Any]], None]
 
 @contextmanager
 def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
-    """Open ``log.jsonl`` and, if ``tensorboard``, TensorBoard's files; yield a function that appends figures."""
+    """Open ``log.jsonl`` and, if ``tensorboard``, TensorBoard's files; yield a function that appends figures.
+
+    If ``active`` is false, no file is opened, and the function does nothing.
+    """
     if not active:
         yield lambda state, figures: None
         return
@@ -52,7 +55,7 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
 
 @contextmanager
 def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
-    """Show a progress bar over samples, only on a terminal; yield a function that sets the step and a text."""
+    """Show a progress bar over samples, only on a terminal; yield a function that sets the step and the text."""
     batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
     hidden = not active or not sys.stderr.isatty()
     with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:

@@ -1,4 +1,4 @@
-"""Validation: what a network finds in scenes that it is not trained on."""
+"""Validation: the keypoints that a network finds in scenes outside its training."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from kpbench.training.recipe import Recipe
 from kpbench.types import UInt8
 
 FOUND_PX, CLOSE_PX = 3.0, 1.0
-"""Largest distance from a keypoint to a detection at which the keypoint counts as found, and as found closely, px."""
+"""A keypoint is found if a detection lies within 3 px, and found closely if a detection lies within 1 px."""
 
 ValidationSets = list[tuple[str, Batch]]
 """Name and samples of each validation set."""
@@ -25,17 +25,17 @@ ValidationSets = list[tuple[str, Batch]]
 def make_validation_sets(
     recipe: Recipe, patches: Sequence[Patch], photos: Sequence[UInt8], count: int = 32
 ) -> ValidationSets:
-    """Make the validation sets of a training; they are a function of the recipe's seed.
+    """Make the validation sets of a training; the recipe's seed determines their random numbers.
 
     Returns
     -------
     list of (str, Batch)
-        "clean": ``count`` whole images without deteriorations. "paper": the same images with the paper's
+        "clean": ``count`` whole images that are not degraded. "paper": the same images with the paper's
         deteriorations. "hard": 8 · ``count`` crops at full severity.
     """
     scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
     crops = replace(recipe.samples, kind="crops", size=(128, 128))
-    seed = recipe.seed + 2**31  # no training batch has such a seed
+    seed = recipe.seed + 2**31  # gives other random numbers than the training batches
     return [
         ("clean", make_batch(scenes, patches, photos, seed, 0, count, 0.0)),
         ("paper", make_batch(scenes, patches, photos, seed, 0, count, 1.0)),
@@ -45,10 +45,11 @@ def make_validation_sets(
 
 @torch.inference_mode()
 def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, float]:
-    """Measure what a network finds, at the default threshold and without verification.
+    """Measure how many keypoints a network finds, at the default threshold and without verification.
 
-    :func:`kpbench.score` cannot score crops, for two reasons. Its ε is relative to the radius, which crops do not hold.
-    Crops also have ignored keypoints: a detection near an ignored keypoint is no false alarm.
+    :func:`kpbench.score` cannot score crops, for two reasons. First, its tolerance ε is relative to the radius of a
+    patch, and the keypoints of crops hold no radius. Second, crops have ignored keypoints; a detection near an ignored
+    keypoint is no false alarm.
 
     Returns
     -------

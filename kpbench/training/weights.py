@@ -1,4 +1,4 @@
-"""Initial weights: from a published file, an exported file or a checkpoint, also of a smaller network."""
+"""Initial weights from a published file, an exported file or a checkpoint; the network may grow from a smaller one."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
 
 BATCHNORM_PX = 128 * 96 * 96
-"""Total number of px of the samples on which BatchNorm is initialised; 2 to 128 samples are used."""
+"""Total number of px in the samples that initialise BatchNorm; between 2 and 128 samples are used."""
 
 
 def load_initial_weights(
@@ -32,7 +32,7 @@ def load_initial_weights(
     backgrounds: str | Path | None,
     device: torch.device,
 ) -> str:
-    """Load initial weights into a fresh training. A network of other sizes grows from the network of the weights.
+    """Load initial weights into a fresh training. If the weights belong to a network of other sizes, grow that network.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def load_initial_weights(
     Returns
     -------
     str
-        One line that tells which weights were found.
+        One line that tells which weights were loaded.
 
     Raises
     ------
@@ -90,7 +90,7 @@ def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[di
     -------
     weights : dict of str to Tensor
     sizes : NetworkConfig or None
-        Sizes of the network of the weights; None if the file does not hold its sizes.
+        Sizes of the network that the weights belong to; None if the file does not hold the sizes.
     """
     shipped = WEIGHTS / f"{name}.onnx"
     path = shipped if shipped.is_file() and not Path(name).is_file() else Path(name)
@@ -113,7 +113,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     Raises
     ------
     DataError
-        If the file cannot be read, or holds anything but named tensors.
+        If the file cannot be read, or is no dict of named tensors.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -157,7 +157,7 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
-        The state-dict. It may lack all BatchNorms, see :func:`restore_batchnorm`.
+        The state-dict. A state-dict without any BatchNorm is allowed, see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
@@ -169,8 +169,8 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     Raises
     ------
     DataError
-        If a tensor has no place in the network or a wrong shape, or if a tensor of any but the attached layers is
-        missing.
+        If a tensor has a name that the network does not know, if a tensor has a wrong shape, or if a tensor outside the
+        attached layers is missing.
     """
     own = network.state_dict()
     bare = is_folded(weights)
@@ -192,12 +192,12 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
 
 
 def is_folded(weights: Mapping[str, Tensor]) -> bool:
-    """Return whether a state-dict has no BatchNorm. Exported files have none, because it is folded."""
+    """Return whether a state-dict has no BatchNorm. An exported file has none, because the export folds BatchNorm."""
     return not any(".bn." in name for name in weights)
 
 
 def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
-    """Make each BatchNorm the identity on some inputs: its weight and bias cancel its statistics.
+    """Make each BatchNorm the identity on given inputs: set its statistics, weight and bias from the inputs.
 
     This is the reverse of folding: the network then computes what its convolutions alone compute, and can be trained.
     ``layers`` : the BatchNorms that are changed; None: all.
@@ -225,11 +225,11 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
 def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
     """Start a network from a trained network of less width or another depth (Chen et al., *Net2Net*, ICLR 2016).
 
-    The channels of the smaller network fill the first channels. The other channels keep their random weights; the
-    weights from these other channels to trained channels are 0. In each stage, convolutions that the smaller network
-    lacks become the identity, and surplus convolutions of the smaller network are left out. The network then computes
-    what the smaller network computes, unless convolutions are left out or the two networks halve the image in different
-    ways.
+    In each layer, the channels of the smaller network fill the first channels. The other channels keep their random
+    weights; the weights from these other channels to trained channels are 0. In each stage, convolutions that the
+    smaller network lacks become the identity, and surplus convolutions of the smaller network are left out. The network
+    then computes what the smaller network computes, unless convolutions are left out or the two networks halve the
+    image in different ways.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     Returns
     -------
     str
-        A few words that tell what was done.
+        A few words that tell how many convolutions were added and left out.
 
     Raises
     ------
@@ -253,7 +253,8 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
         If a layer of the smaller network is wider than the same layer of the network, or if BatchNorm stands after the
         activation in one of the networks.
     """
-    # a BatchNorm after the activation forbids added convolutions: the activation cuts off negative values
+    # with BatchNorm after the activation, an added convolution cannot be the identity: BatchNorm gives negative values,
+    # and the activation cuts off negative values
     if "after" in (smaller.config.norm, network.config.norm):
         raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")
     identities: list[nn.Module] = []
@@ -282,7 +283,7 @@ def _blocks(stage: nn.Module) -> list[nn.Module]:
 
 
 def _copy_channels(layer: nn.Module, given: nn.Module, inputs: int, place: str) -> int:
-    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return the number of channels.
+    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return their number.
 
     ``inputs`` : number of input channels that are trained. ``place`` : name of the layer, for messages.
     """

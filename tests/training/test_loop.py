@@ -237,7 +237,10 @@ def test_shipped_recipes_survive_the_checkpoint(path):
         ("name = 'a'\nphases = []\n[network]\nwidths = [1, 2]", r"network\.widths is \[1, 2\], expected a list of 4"),
         ("name = 'a'\nphases = []\n[network]\nwidths = [0, 2, 3, 4]", "expected four positive numbers each"),
         ("name = 'a'\nphases = []", "expected at least one phase"),
-        ("name = 'a'\nphases = [{ samples = 63 }]", "all have fewer samples than one batch, expected at least 64"),
+        (
+            "name = 'a'\nphases = [{ samples = 63 }]",
+            "together, they have fewer samples than one batch, expected at least 64",
+        ),
         ("name = 'a'\nphases = []\nlr = nan", "lr is nan, expected a number from 0"),
         ("name = 'a'\nphases = []\n[samples]\nsize = [100, 96]", r"size \[100, 96\] .*, expected multiples of 8"),
         ("name = 'a'\nphases = []\n[samples]\nset_size = 0", "set_size 0, expected .* at least 1"),

@@ -73,11 +73,11 @@ def map_images(
         Must be picklable.
     dataset : Dataset
     given : iterable
-        The argument of each image.
+        One argument per image, in the order of the images.
     workers : int
         Number of worker processes; 0: this process does the work.
     label : str
-        Text before the progress bar.
+        Text to the left of the progress bar.
     """
     jobs = list(zip(image_refs(dataset), given, strict=True))
     with progress_bar(label, len(jobs)) as bar:

@@ -2,10 +2,10 @@
 
 The ellipse network sees the surroundings of a place in four octaves. It gives the log odds that the place lies on a
 patch, the centre of the patch, and the ellipse that the patch fills; the design of the patch plays no part. The network
-is trained on places that the detector's network finds, and on places around every keypoint. Most of these places are
-rotated and scaled at random; batches of places are mirrored at random. In an image with designs that the detector's
-network does not know, only the places around keypoints are used. Finally, the log odds are calibrated on a test
-dataset.
+is trained on places that the detector's network finds, and on places around every keypoint. The surroundings of most
+places are rotated and scaled at random; batches of surroundings are mirrored at random. In an image with designs that
+the detector's network does not know, only the places around keypoints are used. Finally, the log odds are calibrated on
+a test dataset.
 """
 
 from __future__ import annotations
@@ -43,14 +43,15 @@ from kpbench.training.verifier.small_networks import (
 from kpbench.types import Float, Float32, Int
 
 ON_PATCH, OFF_PATCH = 0.6, 1.0
-"""A place lies on a patch up to 0.6 short semi-axes from its centre. A place lies on no patch if it is further than
-1.0 long semi-axes from all centres."""
+"""A place within 0.6 short semi-axes of a patch's centre lies on the patch. A place further than 1.0 long semi-axes
+from all centres lies on no patch."""
 EMPTY_PLACES = 14
 """Largest number of places per training image that lie on no patch."""
 MADE_PLACES, MADE_DEVIATION = 3, 0.22
-"""Number of places made around each keypoint of a training image, and their standard deviation, short semi-axes."""
+"""Number of places made around each keypoint of a training image, and the standard deviation of their offsets from the
+keypoint in x and in y, in short semi-axes."""
 ROTATED_SHARE, OCTAVES_OF_SCALE = 0.7, 0.35
-"""Share of training places that are shown rotated and scaled, and the range of the scale, ± octaves."""
+"""Share of training places whose surroundings are rotated and scaled, and largest change of scale in octaves."""
 USUAL_LOG_RADIUS = 2.5
 """Natural logarithm of a usual radius in px; an untrained network predicts about this radius."""
 RADII_PX = ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000))
@@ -128,11 +129,11 @@ def train_ellipse(
     datasets : sequence of Dataset
         Synthetic images to train on.
     test : Dataset
-        Synthetic images for the report, and for the scale of the log odds.
+        Synthetic images for the report, and for the calibration of the log odds.
     out : Path
         Folder for the file.
     epochs, batch : int
-        Passes over all places, and places per step.
+        Number of passes over all places, and number of places per step.
     from_shipped : bool
         Start from the shipped weights. With ``epochs=0``, the report describes the shipped weights.
     workers : int
@@ -180,10 +181,10 @@ def _detector() -> SmallSuperPointDetector:
 def collect_places(image: ImageRef, train: bool) -> Places:
     """Return the places of one image.
 
-    Places between the limits of ``ON_PATCH`` and ``OFF_PATCH`` are left out.
+    Places that lie between ``ON_PATCH`` and ``OFF_PATCH`` are left out.
 
-    ``train`` : True adds places around the keypoints, leaves out most places on no patch, and rotates and scales most
-    places. False returns the other places unchanged.
+    ``train`` : True adds places around the keypoints, keeps at most ``EMPTY_PLACES`` places on no patch, and rotates
+    and scales most surroundings. False returns the detector's places unchanged.
     """
     grey, keypoints = image.read()
     rng = image.rng()
@@ -274,7 +275,7 @@ def calibrate_log_odds(network: EllipseNetwork, places: PlaceTensors) -> None:
 
 
 def _mirror(places: PlaceTensors) -> PlaceTensors:
-    """Mirror a batch in x, y or both, and exchange x and y, at random."""
+    """Mirror a batch at random in x, in y or in both, and exchange x and y at random."""
     surroundings, on, shift, log_map = places
     surroundings = surroundings.float()
     for axis in (0, 1):
@@ -292,8 +293,8 @@ def _report(network: EllipseNetwork, places: PlaceTensors, images: int, say: Say
     """Report how near the ellipses are to the truth, and how many places each threshold of the log odds keeps.
 
     Each range of the short semi-axis has a line. The line gives the shares of places within 0.1 and 0.2 long semi-axes
-    of the true centre, the same shares of predicted centres, and the shares of ellipses whose semi-axes are right to a
-    tenth and to a fifth.
+    of the true centre, the same shares of predicted centres, and the shares of ellipses whose semi-axes are wrong by at
+    most a tenth and a fifth.
     """
     surroundings, on, shift, log_map = places
     out = [network(part.float()) for part in torch.split(surroundings, 1024)]

@@ -1,4 +1,4 @@
-"""The network of both judges."""
+"""The network of a judge; both judges have the same layers."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kpbench.types import Float
 class Judge(nn.Module):
     """Network that takes views and evidence of hypotheses, and returns log odds and corrections of the pose.
 
-    ``evidence`` : training samples (n, columns); their mean and deviation standardise each column.
+    ``evidence`` : training samples (n, columns); their mean and standard deviation standardise each column.
     """
 
     mean: Tensor
@@ -61,7 +61,7 @@ def input_tensors(hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Ten
 
 @torch.inference_mode()
 def apply_judge(network: Judge, hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Float, Hypotheses]:
-    """Judge hypotheses with a network in PyTorch, as :func:`kpbench.detectors.verification.judge` does in ONNX."""
+    """Judge hypotheses like :func:`kpbench.detectors.verification.judge`, but with a network in PyTorch."""
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     odds, shift, log_map = (part.numpy() for part in network(*input_tensors(hypotheses, patches)))

@@ -54,7 +54,7 @@ def report_judges(
 
 
 def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]]], truths: int, say: Say) -> None:
-    """Report the detection scores of detections; each image gives log odds and whether each detection is right."""
+    """Report detection scores; each image gives the log odds of its detections and whether each detection is right."""
     parts = list(of_images)
     log_odds, right = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(-log_odds, kind="stable")
@@ -81,7 +81,7 @@ def _count_explained(
 def _select_reported(
     log_odds: Float, hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return log odds and rightness of the hypotheses that a detector without a threshold would report."""
+    """Return the log odds of the hypotheses that a detector without threshold reports, and whether each is right."""
     best = select_likeliest(hypotheses.place, log_odds)
     hypotheses, log_odds = hypotheses[best], log_odds[best]
     reach = np.maximum(Decoding.separation_px, DISC_SHARE * short_semi_axis(hypotheses.A))

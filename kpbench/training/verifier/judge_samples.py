@@ -31,7 +31,7 @@ from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 from kpbench.types import Float, UInt8
 
 TRAINING_MARGIN = 1.0
-"""Training lowers the thresholds of the log odds for the second look and for the fit by this amount."""
+"""Amount by which training lowers the two thresholds of the log odds: for the second look and for the fit."""
 SPECKLED_EVERY = 3
 """One training image in this many has specks."""
 
@@ -49,9 +49,9 @@ class ImageLooks:
     candidate_right : ndarray of shape (n,), bool
         Whether each candidate is right.
     first_look, second_look : Hypotheses
-        Hypotheses as proposed, and hypotheses in the poses that the shipped first judge corrected at the first look.
+        Hypotheses in the proposed poses, and hypotheses in the poses that the shipped first judge corrected.
     shipped_log_odds : ndarray
-        Log odds by the shipped first judge: first of ``first_look``, then of ``second_look``.
+        Log odds by the shipped first judge for the hypotheses of ``first_look``, followed by those of ``second_look``.
     """
 
     keypoints: NDArray[Any]
@@ -95,7 +95,9 @@ def _unpack_judge(packed: bytes) -> Judge:
 def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
     """Return the hypotheses of one image at the two looks of the first judge.
 
-    ``train`` : draw specks into one image in three, and admit less likely hypotheses to the second look.
+    The threshold for the second look is lower than in a detector, by ``TRAINING_MARGIN``.
+
+    ``train`` : draw specks into one image in three.
     """
     detector = load_places_detector(detector_path)
     grey, keypoints = read_image(image, train)
@@ -120,8 +122,9 @@ def collect_fits(
 ) -> ImageFits:
     """Return the hypotheses of one image after two looks of the new first judge and after the fit.
 
-    ``train`` : draw the same specks, and fit less likely hypotheses. The first judge is very sure about the images that
-    trained it. Without less likely hypotheses, the second judge would see too few wrong hypotheses.
+    ``train`` : draw the same specks as :func:`collect_looks`, and fit less likely hypotheses too. The first judge is
+    very sure about the images that trained it. Without less likely hypotheses, the second judge would see too few wrong
+    hypotheses.
     """
     patches, new_judge = load_places_detector(detector_path).patches, _unpack_judge(packed_judge)
     pyramids, margin = Pyramids(read_image(image, train)[0]), TRAINING_MARGIN if train else 0.0

@@ -1,13 +1,13 @@
 """Training of the two judges (:func:`kpbench.detectors.verification.judge`).
 
-Both judges have a small network of the same form. A hypothesis is right if its centre lies near a keypoint of its
-design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long semi-axes for the second
-judge, after the fit. Of several rotations of a design at one place, only the best rotation is right. Each judge also
-learns to correct the pose.
+Both judges are small networks with the same layers, but different widths. A hypothesis is right if its centre lies near
+a keypoint of its design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long
+semi-axes for the second judge, after the fit. Of several rotations of a design at one place, only the best rotation is
+right. Each judge also learns to correct the pose.
 
 The first judge is trained on the hypotheses of its first look and of its second look. For the second look, the shipped
-first judge corrects the poses, because the new judge does not exist yet. Hypotheses that the shipped first judge judges
-rightly and surely are drawn rarely, and a drawn hypothesis of this kind gets more weight.
+first judge corrects the poses, because the new judge does not exist yet. A hypothesis that the shipped first judge
+rates correctly with high certainty is drawn rarely, and gets more weight if drawn.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ from kpbench.types import Float
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
 """Channels of the first layers of the first judge, and of the second judge."""
 KNOWN_SHARE = 12.0
-"""A hypothesis judged rightly with log odds ±z is drawn with probability min(KNOWN_SHARE · exp(-z/2), 1) per epoch."""
+"""Probability per epoch that a hypothesis rated correctly with log odds ±z is drawn: min(KNOWN_SHARE · exp(-z/2),
+1)."""
 
 
 def train_judges(
@@ -158,7 +159,7 @@ def _label(
 ) -> LabelledHypotheses:
     """Label the hypotheses of many images.
 
-    ``known_log_odds`` : log odds by an earlier judge; 0 if there was none.
+    ``known_log_odds`` : log odds by an earlier judge; 0 without an earlier judge.
     """
     pairs = list(zip(hypotheses, truths, strict=True))
     right = np.concatenate([label_hypotheses(part, patches, truth, tolerance) for part, truth in pairs])
@@ -187,7 +188,7 @@ def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], 
 def _train(training: LabelledHypotheses, name: str, width: int, settings: _Settings) -> Judge:
     """Train a judge.
 
-    Minimises the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
+    Minimise the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
     """
     torch.manual_seed(0)
     rng = np.random.default_rng(0)

@@ -15,9 +15,10 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Int
 
 POSE_TOLERANCE, FIT_TOLERANCE = 0.2, 0.1
-"""Largest distance of a right centre from the true centre, before and after the fit, in long semi-axes."""
+"""Largest distance between the centre of a right hypothesis and the true centre, before and after the fit, in long
+semi-axes."""
 NEAR_RADII = 0.5
-"""A judge learns the pose from hypotheses of the right design within this distance, in long semi-axes."""
+"""A judge learns the pose from hypotheses of the right design within this distance of a keypoint, in long semi-axes."""
 LARGEST_LOG_MAP = 1.0
 """A judge does not learn the pose from a hypothesis with a larger error in an entry of the log map."""
 
@@ -28,7 +29,7 @@ def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
 
 
 def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
-    """Return whether each place (n, 2) px lies near its nearest keypoint and has the patch ID of that keypoint.
+    """Return whether each place (n, 2), px, lies near its nearest keypoint and has the patch ID of this keypoint.
 
     ``tolerance`` : largest distance, in long semi-axes of the keypoint.
     """
@@ -58,7 +59,7 @@ def label_hypotheses(
         own, _ = _nearest_keypoint(hypotheses.xy[rows], keypoints)
         relative = np.linalg.inv(hypotheses.A[rows]) @ affine_at_centre(keypoints["H_patch2image"][own])
         angle = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-        # a design that looks the same after half a turn has half as many templates, and the period of half a turn
+        # a design that looks the same after half a turn has half as many templates, and repeats after half a turn
         rotations = np.bincount(build_templates(patches).whole.rotated_design)
         period = (2 * np.pi * rotations / rotations.max())[hypotheses.design[rows]]
         error = np.abs((angle + period / 2) % period - period / 2)

@@ -104,10 +104,10 @@ def train_one_cycle(
 
 @torch.no_grad()
 def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> None:
-    """Give a network the shipped weights; the weights of convolutions are stored in 7 bits.
+    """Load the shipped weights into a network; the file stores the weights of convolutions in 7 bits.
 
-    The shipped file has no BatchNorm. Each BatchNorm becomes the identity, apart from the bias of its convolution; the
-    inputs ``seen`` give the statistics.
+    The shipped file has no BatchNorm. Each BatchNorm only adds the bias of its convolution; the inputs ``seen`` give
+    the statistics.
     """
     graph = onnx.load(WEIGHTS / f"{name}.onnx").graph
     stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
@@ -133,7 +133,7 @@ def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> Non
 def write_network(
     network: nn.Module, inputs: Sequence[str], seen: Sequence[tuple[Tensor, ...]], file: Path, say: Say
 ) -> None:
-    """Write a network as an ONNX file in 8-bit integers; the file takes any number of places.
+    """Write a network as an ONNX file in 8-bit integers; the ONNX network takes any number of places.
 
     Parameters
     ----------
