@@ -6,7 +6,10 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
+received: list[int] = []
+"""The numbers of the signals that :func:`handle_end_signals` has handled in this process."""
 END_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
@@ -36,8 +39,13 @@ def handle_end_signals(handle: Callable[[int], None]) -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
+
+    def receive(number: int, _: FrameType | None) -> None:
+        received.append(number)
+        handle(number)
+
     caught = [number for number in END_SIGNALS if signal.getsignal(number) != signal.SIG_IGN]
-    before = {number: signal.signal(number, lambda number, _: handle(number)) for number in caught}
+    before = {number: signal.signal(number, receive) for number in caught}
     try:
         yield
     finally:

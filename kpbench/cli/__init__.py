@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import importlib
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Callable
@@ -58,13 +57,11 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
-        from kpbench.cli.process import end_by_signals  # here, as both would slow down `kpbench --help`
+        from kpbench.cli.process import end_by_signals, exit_code  # here, as both would slow down `kpbench --help`
         from kpbench.files import protect_read_files
 
-        signals = list[int]()
-
         try:
-            with protect_read_files(), end_by_signals(signals), warnings.catch_warnings():
+            with protect_read_files(), end_by_signals(), warnings.catch_warnings():
                 warnings.simplefilter("default", KpbenchWarning)
                 warnings.showwarning = partial(self._show_warning, ctx, warnings.showwarning)
                 return super().invoke(ctx)
@@ -80,7 +77,7 @@ class LazyGroup(click.Group):
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
             click.echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
-            sys.exit(128 + (signals[0] if signals else signal.SIGINT))
+            sys.exit(exit_code())
 
     def _show_warning(self, ctx: click.Context, show: Callable[..., None], message: Warning, *more: Any) -> None:
         if isinstance(message, KpbenchWarning):

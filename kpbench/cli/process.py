@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-from kpbench.signals import handle_end_signals
+from kpbench.signals import handle_end_signals, received
 
 
 @contextmanager
-def end_by_signals(signals: list[int]) -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end a command as Ctrl-C does, and append the number of the signal to ``signals``."""
+def end_by_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end a command as Ctrl-C does."""
+    received.clear()
 
     def interrupt(number: int) -> None:
-        if not signals:  # a second signal must not disturb the end
-            signals.append(number)
+        if len(received) == 1:  # a second signal must not disturb the end
             raise KeyboardInterrupt
 
     with handle_end_signals(interrupt):
         yield
+
+
+def exit_code() -> int:
+    """Return the exit code of an interrupted command, as shells define it: 128 and the number of the signal."""
+    return 128 + (received[0] if received else signal.SIGINT)
 
 
 def open_standard_streams() -> None:
