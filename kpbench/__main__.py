@@ -1,6 +1,6 @@
 """``python -m kpbench`` is ``kpbench``."""
 
-from kpbench.cli import main
+from kpbench.cli import run
 
 if __name__ == "__main__":
-    main(prog_name="kpbench")
+    run()

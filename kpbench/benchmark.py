@@ -28,6 +28,7 @@ from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
 from kpbench.files import make_folder, require_own_folder
+from kpbench.locks import lock_folder
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.report.paper import PAPER
@@ -39,7 +40,7 @@ from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.types import Predictions
 from kpbench.workers import Progress, run_jobs
-from kpbench.writing import remove_file, write_file
+from kpbench.writing import remove_file, remove_leftovers, write_file
 
 IMAGES_PER_PART = 32
 """Number of images in a part. Each part has a file of detections until all parts are joined."""
@@ -169,6 +170,13 @@ def bench(
     (16, ())
     """
     require_own_folder(Path(out), "suites", "a bench")
+    with lock_folder(make_folder(Path(out))):
+        return _run_bench(suites, detectors, Path(out), workers, progress)
+
+
+def _run_bench(
+    suites: Sequence[SuiteConfig], detectors: Sequence[str], out: Path, workers: int | None, progress: Progress
+) -> list[BenchRun]:
     loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
     labels = [detector.name for detector in loaded.values()]
     if len(set(labels)) < len(labels):
@@ -180,9 +188,9 @@ def bench(
         for name, detector in loaded.items():
             config = replace(suite, board=detector.board)
             if config not in datasets:
-                datasets[config] = _make_dataset(config, Path(out) / "suites", workers, progress)
+                datasets[config] = _make_dataset(config, out / "suites", workers, progress)
             dataset = datasets[config]
-            folder = Path(out) / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
+            folder = out / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
             file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_digest_detector(detector)[:8]}.json"
             runs.append((config, dataset, file))
             if detector.identity is None:
@@ -243,8 +251,12 @@ def _detect_parts(parts: Sequence[_Part], workers: int | None, progress: Progres
     """Run all parts whose files do not exist."""
     missing = [part for part in parts if not part.file.exists()]
     progress(sum(part.count for part in parts) - sum(part.count for part in missing))
-    for _ in run_jobs(_detect_part, missing, workers, progress):
-        pass
+    try:
+        for _ in run_jobs(_detect_part, missing, workers, progress):
+            pass
+    except BaseException:
+        remove_leftovers(part.file for part in missing)  # of killed workers
+        raise
 
 
 def _detect_part(part: _Part, progress: Progress) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import os
-import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,14 +17,16 @@ from concurrent.futures import (
     ProcessPoolExecutor,
     wait,
 )
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cv2
 from threadpoolctl import ThreadpoolController, threadpool_limits
 
 from kpbench.errors import DataError
+from kpbench.signals import block_end_signals
 
 JobT = TypeVar("JobT")
 ResultT = TypeVar("ResultT")
@@ -151,9 +152,13 @@ def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     The processes are killed if the block ends early: by an error, or because no more results are asked for.
     """
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV, HDF5 or torch may hang
+    with block_end_signals():
+        resource_tracker.ensure_running()  # else the next line starts this process of multiprocessing
     counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    pool.submit(int)  # an empty first job starts all processes, so that the next line finds them
+    with block_end_signals():
+        for _ in range(workers):
+            pool.submit(int)  # each empty job starts a process, so that the next line finds all
     processes = set(multiprocessing.active_children()) - others
     try:
         yield pool, counter
@@ -244,16 +249,10 @@ _counter: Any = None
 
 
 def _start_worker(counter: Any) -> None:
-    """Prepare a new worker process: use one thread, ignore signals, and end with the parent process.
-
-    Ctrl-C and batch systems send their signal to every process of a run. The parent process alone reacts to the signal.
-    """
+    """Prepare a new worker process: use one thread, and end with the parent process."""
     global _counter
     _counter = counter
     use_one_thread()
-    with suppress(ValueError):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
     _end_with_parent()
 
 

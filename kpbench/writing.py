@@ -11,13 +11,12 @@
 from __future__ import annotations
 
 import errno
-import glob
 import os
 import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -146,11 +145,17 @@ def remove_file(path: Path, kind: str) -> None:
         raise DataError(f"{path}: cannot be removed, {error.strerror}") from None
 
 
-def remove_leftovers(path: Path) -> None:
-    """Remove the temporary files that a killed run left beside a path."""
-    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
-        with suppress(OSError):
-            part.unlink()
+def remove_leftovers(paths: Iterable[Path]) -> None:
+    """Remove the unfinished parts of files that a killed process left behind. Files at URLs have no such parts."""
+    names: dict[Path, set[str]] = {}
+    for path in paths:
+        if is_local(path):
+            names.setdefault(path.parent, set()).add(path.name)
+    for folder, wanted in names.items():
+        for part in folder.glob(".*.part"):
+            if part.name[1:-14] in wanted:  # .NAME.01234567.part
+                with suppress(OSError):
+                    part.unlink()
 
 
 def _find_target(path: Path) -> tuple[Path, int | None]:

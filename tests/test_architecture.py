@@ -29,8 +29,10 @@ GROUND = {
     "files": ["errors"],
     "toml": ["errors", "files"],
     "writing": ["errors", "files"],
+    "locks": ["errors", "files"],
+    "signals": [],
     "images": ["errors", "types", "files", "writing"],
-    "workers": ["errors"],
+    "workers": ["errors", "signals"],
     "seeds": [],
 }
 """What every stage shares, and what each of these modules may import."""

@@ -1,11 +1,12 @@
 """Runs of ``kpbench synth`` that are killed, interrupted or starved at random moments, and what is left of them.
 
 Kinds: ``parent`` (kill -9 of the command), ``worker`` (kill -9 of one of its processes), ``interrupt`` (Ctrl-C),
-``disk`` (all free space of a tmpfs is taken; needs the right to mount one). After each, every shard that is there must
-equal that of an undisturbed run and the folder must not open as a dataset unless it is whole; then ``--resume`` must
-give the undisturbed run's bytes in every file.
+``terminate`` (SIGTERM) and ``hangup`` (SIGHUP) to all processes, ``disk`` (all free space of a tmpfs is taken; needs
+the right to mount one). After each, every shard that is there must equal that of an undisturbed run and the folder must
+not open as a dataset unless it is whole; then ``--resume`` must give the undisturbed run's bytes in every file.
+``interrupt_commands.py`` does the like for other commands.
 
-    python benchmarks/robustness/interrupt.py [--moments 50] [--kinds parent,worker,interrupt,disk]
+    python benchmarks/robustness/interrupt.py [--moments 50] [--kinds parent,worker,interrupt,terminate,hangup,disk]
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ from kpbench.files import sha256_of
 
 CONFIG = SynthConfig(n=48, size_px=(320, 240), shard_size=4)
 WORDS = ["synth", "--n", "48", "--size", "320x240", "--shard-size", "4", "--workers", "2"]
-KINDS = ("parent", "worker", "interrupt", "disk")
+KINDS = ("parent", "worker", "interrupt", "terminate", "hangup", "disk")
+SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM, "hangup": signal.SIGHUP}
 
 
 def start(out: Path, *more: str) -> subprocess.Popen[str]:
     # a shell's background jobs ignore Ctrl-C; the command must not inherit that
     code = "import signal, kpbench.cli; signal.signal(signal.SIGINT, signal.default_int_handler); kpbench.cli.main()"
     words = [sys.executable, "-c", code, *WORDS, "--out", str(out), *more]
-    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -65,8 +67,8 @@ def small_disk(folder: Path, megabytes: int) -> Iterator[None]:
 def strike(kind: str, run: subprocess.Popen[str], out: Path) -> None:
     if kind == "parent":
         run.kill()
-    elif kind == "interrupt":
-        run.send_signal(signal.SIGINT)
+    elif kind in SIGNALS:
+        os.killpg(run.pid, SIGNALS[kind])
     elif kind == "worker":
         for child in children(run.pid)[:1]:
             os.kill(child, signal.SIGKILL)
@@ -94,6 +96,7 @@ def moment(kind: str, shards: int, delay_s: float, folder: Path, expected: dict[
     assert left.items() <= expected.items(), f"{kind}: something half-written is listed: {sorted(left)}"
     if run.returncode != 0:
         assert "Traceback" not in said, said
+        assert kind not in SIGNALS or not list(out.glob(".*")), "a hidden file is left"
         assert kind == "parent" or "--resume" in said, said
         with suppress(DataError):
             assert "dataset.json" in left, open_dataset(out)

@@ -57,10 +57,11 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
-        from kpbench.files import protect_read_files  # imported here to keep `kpbench --help` fast
+        from kpbench.cli.process import end_by_signals, exit_code  # here, as both would slow down `kpbench --help`
+        from kpbench.files import protect_read_files
 
         try:
-            with protect_read_files(), warnings.catch_warnings():
+            with protect_read_files(), end_by_signals(), warnings.catch_warnings():
                 warnings.simplefilter("default", KpbenchWarning)
                 warnings.showwarning = partial(self._show_warning, ctx, warnings.showwarning)
                 return super().invoke(ctx)
@@ -76,7 +77,7 @@ class LazyGroup(click.Group):
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
             click.echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
-            sys.exit(130)
+            sys.exit(exit_code())
 
     def _show_warning(self, ctx: click.Context, show: Callable[..., None], message: Warning, *more: Any) -> None:
         if isinstance(message, KpbenchWarning):
@@ -100,3 +101,11 @@ def main() -> None:
     Start here:
       kpbench demo
     """
+
+
+def run() -> None:
+    """Run the command line as a process of its own."""
+    from kpbench.cli.process import open_standard_streams
+
+    open_standard_streams()
+    main(prog_name="kpbench")

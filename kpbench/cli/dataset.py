@@ -97,5 +97,8 @@ def export(dataset: Path, file_format: str, out: Path | None) -> None:
     from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
-    with progress_bar(len(data), "export") as progress:
-        click.echo(str(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress)))
+    try:
+        with progress_bar(len(data), "export") as progress:
+            click.echo(str(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress)))
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("the same command continues the export") from None

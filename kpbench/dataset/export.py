@@ -22,12 +22,15 @@ from kpbench.errors import DataError
 from kpbench.files import make_folder
 from kpbench.geometry.homography import project_disc_boxes
 from kpbench.images import encode_png
+from kpbench.locks import LOCK_FILE, lock_folder
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
-from kpbench.writing import write_file
+from kpbench.writing import remove_file, write_file
 
 EXPORT_MARK = "kpbench.export/1"
 """Mark in the main file of an export to COCO or YOLO."""
+UNFINISHED = ".kpbench-unfinished"
+"""File that stands in the folder of an export until the export is finished. The same export then continues."""
 
 
 def export_dataset(
@@ -52,7 +55,8 @@ def export_dataset(
     Raises
     ------
     DataError
-        If the format is unknown, the folder is not empty, or a file cannot be written.
+        If the format is unknown, the folder holds other files, or a file cannot be written. An interrupted export
+        continues when the same export is asked for again.
 
     Examples
     --------
@@ -63,11 +67,19 @@ def export_dataset(
     if file_format not in EXPORT_FORMATS:
         raise DataError(f"`file_format` is {file_format!r}, expected one of: {', '.join(EXPORT_FORMATS)}")
     folder = Path(out)
-    if folder.is_dir() and any(folder.iterdir()):
-        raise DataError(f"{folder}: is not empty; name a new folder as `out`")
-    make_folder(folder)
-    main_file = EXPORT_FORMATS[file_format](dataset, folder, progress)
-    write_card(dataset, folder)
+    mark, content = folder / UNFINISHED, f"{EXPORT_MARK} {file_format} {dataset.fingerprint}\n".encode()
+    if folder.is_dir() and any(path.name != LOCK_FILE for path in folder.iterdir()):
+        if not mark.is_file():
+            raise DataError(f"{folder}: is not empty; name a new folder as `out`")
+        if mark.read_bytes() != content:
+            raise DataError(f"{folder}: holds another unfinished export; name a new folder as `out`")
+    with lock_folder(make_folder(folder)):
+        for part in folder.rglob(".*.part"):  # of a killed run
+            part.unlink()
+        write_file(mark, content)
+        main_file = EXPORT_FORMATS[file_format](dataset, folder, progress)
+        write_card(dataset, folder)
+        remove_file(mark, "export")
     return main_file
 
 
@@ -87,7 +99,7 @@ def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
 
 def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     """Write COCO keypoints. Each design is a category with one keypoint. Annotations also hold kpbench's columns."""
-    (folder / "images").mkdir()
+    make_folder(folder / "images")
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []
     ids = dataset.truth.image_id
@@ -135,7 +147,7 @@ def _scoring_groups(dataset: Dataset, n: int) -> dict[str, Any]:
 def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     """Write YOLO-pose: one text file per image, with lengths as fractions of the image's width or height."""
     for name in ("images", "labels"):
-        (folder / name).mkdir()
+        make_folder(folder / name)
     ids = dataset.truth.image_id
     names = patch_names(dataset)
     classes = {patch_id: n for n, patch_id in enumerate(names)}

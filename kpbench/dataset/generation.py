@@ -15,7 +15,7 @@ import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache, partial
 from importlib import metadata
@@ -30,7 +30,6 @@ from kpbench.dataset.resume import (
     PlannedShard,
     add_resume_hint,
     find_finished_shards,
-    lock_folder,
     name_folder_in_errors,
     plan_shards,
     prepare_folder,
@@ -39,8 +38,9 @@ from kpbench.dataset.resume import (
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, make_folder
+from kpbench.locks import lock_folder
 from kpbench.workers import Progress, dask_executor, run_jobs
-from kpbench.writing import write_file
+from kpbench.writing import remove_leftovers, write_file
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,8 @@ def generate(
         run = _Run(config, folder, written, plan, workers, executor, progress)
         with lock_folder(folder):
             kept = prepare_folder(folder, written, plan, resume, overwrite)
-            finished = _make_missing_shards(run, kept)
+            with _remove_leftovers_at_end(run):
+                finished = _make_missing_shards(run, kept)
             dataset, broken_files = _finish_dataset(folder, written, [finished[shard.file] for shard in plan])
     return GenerationResult(dataset, broken_files, sum(shard.entry.count for shard in kept.values()))
 
@@ -182,7 +183,8 @@ def generate_part(
         run = _Run(config, folder, written, part, workers, executor, progress)
         with lock_folder(folder, shared=True):
             kept = prepare_folder(folder, written, part, resume, overwrite)
-            finished = _make_missing_shards(run, kept)
+            with _remove_leftovers_at_end(run):
+                finished = _make_missing_shards(run, kept)
     return sum(shard.entry.count for shard in finished.values())
 
 
@@ -270,6 +272,16 @@ class _Run:
     workers: int | None
     executor: Executor | None
     progress: Progress
+
+
+@contextmanager
+def _remove_leftovers_at_end(run: _Run) -> Iterator[None]:
+    """Remove, if the run ends early, what its killed workers were writing."""
+    try:
+        yield
+    except BaseException:
+        remove_leftovers(run.folder / shard.file for shard in run.plan)
+        raise
 
 
 def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str, FinishedShard]:

@@ -1,12 +1,9 @@
-"""Resuming a run: which shards of an earlier run are kept, and the lock against a second run."""
+"""Resuming a run: which shards of an earlier run are kept."""
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import re
-import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,11 +13,10 @@ from typing import Any
 from kpbench.dataset.card import CARD_FILES
 from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
 from kpbench.dataset.shard import canonical_json, open_shard, read_text_attribute
-from kpbench.errors import DataError, KpbenchWarning
-from kpbench.files import is_local, sha256_of
+from kpbench.errors import DataError
+from kpbench.files import sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
-LOCK_FILE = ".kpbench.lock"
 LONGEST_VALUE = 40
 """An error message shows two different values of a key only if each value has fewer characters than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
@@ -103,8 +99,7 @@ def prepare_folder(
         problem = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
         remedy = "add `resume=True` to finish it, `overwrite=True` to replace it, or another `out`"
         raise DataError(f"{folder}: {problem}; {remedy}")
-    for name in names:
-        remove_leftovers(folder / name)
+    remove_leftovers(folder / name for name in names)
     if overwrite or not resume:
         return {}
     for path in concerned:
@@ -198,49 +193,3 @@ def add_resume_hint(folder: Path) -> Iterator[None]:
         has_shards = any(folder.glob("shard-*.h5"))
         hint = "; finished shards are kept, add `resume=True` to go on" if has_shards else ""
         raise DataError(f"{error}{hint}") from None
-
-
-@contextmanager
-def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Lock a folder against other runs. The lock ends with the process, even if the process is killed.
-
-    Parameters
-    ----------
-    folder : Path
-        A folder at a URL is not locked: object stores have no locks.
-    shared : bool
-        Allow other runs with a shared lock at the same time. No two of these runs may write the same shard.
-
-    Raises
-    ------
-    DataError
-        If another run holds the lock, or the lock's file cannot be written.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows has no flock, so the folder is not locked
-        yield
-        return
-    if not is_local(folder):
-        yield
-        return
-    path = folder / LOCK_FILE
-    try:
-        file = open(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+b")  # noqa: SIM115
-    except OSError as error:
-        reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
-        raise DataError(f"{path}: cannot be written, {reason}") from None
-    with file:
-        try:
-            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-            if not os.path.samestat(os.fstat(file.fileno()), path.stat()):  # another run deleted the file before flock
-                raise BlockingIOError
-        except (BlockingIOError, FileNotFoundError):
-            raise DataError(f"{folder}: another kpbench run is writing to it") from None
-        except OSError:  # a file system without locks, such as some network file systems
-            warnings.warn(f"{folder}: cannot be locked; let no other run write to it", KpbenchWarning, stacklevel=2)
-        try:
-            yield
-        finally:
-            if not shared:
-                path.unlink(missing_ok=True)

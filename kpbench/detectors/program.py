@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shlex
+import signal
 import subprocess
 import tempfile
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -13,6 +16,28 @@ import cv2
 from kpbench.errors import DataError
 from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
+
+
+def _run(words: Sequence[str], stderr: Path) -> tuple[int, str]:
+    """Run a program; return its exit code, and its standard error with a mark for each byte that is not UTF-8.
+
+    Standard error goes to a file, not to a pipe: a process that the program leaves behind would keep a pipe open. If
+    kpbench is interrupted, the program and its children are killed.
+    """
+    with stderr.open("wb") as file:
+        try:
+            program = subprocess.Popen(
+                words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True
+            )
+        except (OSError, ValueError) as error:
+            raise DataError(f"{words[0]}: cannot be started, {getattr(error, 'strerror', error)}") from None
+        try:
+            code = program.wait()
+        except BaseException:
+            with suppress(OSError):
+                os.killpg(program.pid, signal.SIGKILL)
+            raise
+    return code, stderr.read_text("utf-8", errors="replace")
 
 
 def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
@@ -46,13 +71,10 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
         for n, image in enumerate(images):
             if not cv2.imwrite(str(folder / f"{n:08d}.png"), image if image.ndim == 2 else image[..., ::-1]):
                 raise DataError(f"{folder}: cannot be written, is the disk full?")
-        try:
-            done = subprocess.run([*shlex.split(command), str(folder), str(out)], capture_output=True, text=True)
-        except OSError as error:
-            raise DataError(f"{command}: cannot be started, {error.strerror}") from None
-        if done.returncode:
-            lines = done.stderr.strip().splitlines() or ["nothing on stderr"]
-            raise DataError(f"{command}: exit code {done.returncode}, {lines[-1]}")
+        code, stderr = _run([*shlex.split(command), str(folder), str(out)], Path(scratch) / "stderr")
+        if code:
+            lines = stderr.strip().splitlines() or ["nothing on stderr"]
+            raise DataError(f"{command}: exit code {code}, {lines[-1]}")
         if not out.exists():
             raise DataError(f"{command}: wrote no predictions file where its last argument says")
         found = read_predictions(out)

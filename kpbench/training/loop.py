@@ -9,11 +9,9 @@ Under ``torchrun`` with n processes, each process takes 1/n of the samples of ea
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -22,7 +20,9 @@ from torch import nn
 
 from kpbench.errors import DataError
 from kpbench.files import make_folder
+from kpbench.locks import lock_folder
 from kpbench.patches.design import Patch, shipped_patches
+from kpbench.signals import handle_end_signals
 from kpbench.training.batches import Batch, BatchJob, load_photos, training_batches
 from kpbench.training.checkpoint import TrainingState, restore_state, save_checkpoint, start_state
 from kpbench.training.process_group import ProcessGroup, join_process_group
@@ -126,12 +126,13 @@ def train(
     """
     training = _Training(recipe, Path(out), backgrounds, tuple(patches), options, join_process_group())
     training.check()
-    make_folder(training.folder)
-    state = training.begin(say)
-    with _signals_seen() as signalled:
-        training.run(state, signalled)
-        interrupted = signalled()
-    if interrupted:
+    leads = training.group.rank == 0
+    signals = list[int]()
+    with lock_folder(make_folder(training.folder)) if leads else nullcontext(), handle_end_signals(signals.append):
+        training.check()  # again: a run may have ended since
+        state = training.begin(say)
+        training.run(state, signals)
+    if signals:
         raise KeyboardInterrupt(
             f"{training.checkpoint} is at step {state.step}; the same command with `resume` goes on"
         )
@@ -178,7 +179,7 @@ class _Training:
             say(load_initial_weights(state, init, self.designs, self.backgrounds, device))
         return state
 
-    def run(self, state: TrainingState, signalled: Callable[[], bool]) -> None:
+    def run(self, state: TrainingState, signals: Sequence[int]) -> None:
         """Train until the recipe is finished, the time limit is reached or a signal comes.
 
         Checkpoints, validations and lines of the log are made regularly.
@@ -202,7 +203,7 @@ class _Training:
                 meter.add(train_step(state, forward, images, keypoints, group))
                 elapsed = time.monotonic() - self.began
                 state.seconds = before + elapsed
-                stop = group.any_of(signalled() or (options.minutes is not None and elapsed > 60 * options.minutes))
+                stop = group.any_of(bool(signals) or (options.minutes is not None and elapsed > 60 * options.minutes))
                 last = stop or state.step == self.recipe.steps
                 if last or reporting.due():
                     figures = meter.read(state)
@@ -232,18 +233,3 @@ class _Training:
         )
         workers = self.options.workers
         return training_batches(recipe.samples, self.designs, self.backgrounds, recipe.seed, jobs, workers)
-
-
-@contextmanager
-def _signals_seen() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM, so that the current step can end; yield a function that tells whether a signal came."""
-    seen = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield seen.is_set
-        return
-    before = {s: signal.signal(s, lambda *_: seen.set()) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield seen.is_set
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
