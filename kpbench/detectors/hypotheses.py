@@ -1,4 +1,7 @@
-"""Hypotheses of the verification: places, each with a design, a pose and evidence."""
+"""Hypotheses of the verification: places, each with a design, a pose and evidence.
+
+:mod:`kpbench.detectors.verification` introduces the networks, the judges and the steps.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +21,20 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""If two hypotheses of one design have centres nearer than this, in short semi-axes, only the likelier is kept."""
+"""Of two hypotheses of one design, the less likely is dropped if the centres are nearer than this, in short semi-axes of
+the likelier hypothesis."""
 
 
 class Evidence(IntEnum):
     """Columns of the evidence that a judge sees.
 
     The first judge sees the columns from ``NETWORK_SCORE`` to ``RADIUS``. The second judge, after the fit, sees all
-    columns. Logs are natural. Distances are in short semi-axes.
+    columns. Logs are natural. Distances are in short semi-axes. Formulas leave out the small constants that keep the
+    logs finite. The contrast is white - black.
     """
 
     NETWORK_SCORE = 0
-    """Log odds of the network's score."""
+    """Log odds of the detector head's score."""
     ID_PATCH = 1
     """Log probability, by the ID head, that there is a patch."""
     ID_DESIGN = 2
@@ -39,27 +44,27 @@ class Evidence(IntEnum):
     NCC = 4
     """-log(1.01 - correlation of the whole design with the image)."""
     SHIFT = 5
-    """Log of the distance of the centre from the network's place."""
+    """Log of the distance from the candidate's place to the centre."""
     CONTRAST = 6
-    """Log of the ratio of half the contrast to the image's range of grey levels."""
+    """log(contrast / 2 / range of the image's grey levels)."""
     CONTRAST_TO_NOISE = 7
-    """Log of the ratio of half the contrast to the image's noise."""
+    """log(contrast / 2 / noise of the image)."""
     RADIUS = 8
     """Log of the short semi-axis, px."""
     FIT_NCC = 9
     """-log(1.01 - correlation of the fitted design with the image)."""
     FIT_UNEXPLAINED = 10
-    """Log of the ratio of the fit's residuals beyond the image's noise to the contrast."""
+    """log(√(residual² - noise²) / contrast): the fit's residuals beyond the image's noise."""
     FIT_BLUR = 11
     """Standard deviation of the blur, in short semi-axes."""
     FIT_SHIFT = 12
-    """Log of the distance of the fitted centre from the network's place."""
+    """Log of the distance from the candidate's place to the fitted centre."""
     FIT_MOVE = 13
-    """Log of the distance of the fitted centre from the centre before the fit."""
+    """Log of the distance from the centre before the fit to the fitted centre."""
     FIT_CONTRAST = 14
-    """Log of the ratio of the fitted contrast to the image's range of grey levels."""
+    """log(fitted contrast / range of the image's grey levels)."""
     FIT_CONTRAST_TO_NOISE = 15
-    """Log of the ratio of the fitted contrast to the image's noise."""
+    """log(fitted contrast / noise of the image)."""
     FIT_RADIUS = 16
     """Log of the fitted short semi-axis, px."""
     FIRST_JUDGE = 17
@@ -69,14 +74,14 @@ class Evidence(IntEnum):
     OTHER_ERRORS = 19
     """Log of 1 + the expected number of wrong hypotheses elsewhere in the image."""
     OTHER_BLUR = 20
-    """Log of the ratio of the blur to the mean blur of the other patches."""
+    """log(blur in px) minus its mean over the hypotheses elsewhere, shrunk towards 0 if few of these are likely."""
     OTHER_CONTRAST = 21
-    """Log of the ratio of the contrast to the mean contrast of the other patches."""
+    """log(contrast) minus its mean over the hypotheses elsewhere, shrunk towards 0 if few of these are likely."""
 
 
 @dataclass(frozen=True)
 class Hypotheses:
-    """n hypotheses: each says that a place lies on a patch of some design, in some pose.
+    """n hypotheses. Each hypothesis says that a place lies on a patch of one design, in one pose.
 
     Attributes
     ----------
@@ -143,8 +148,8 @@ def judge_inputs(hypotheses: Hypotheses, patches: Sequence[Patch]) -> dict[str, 
     Returns
     -------
     dict
-        ``view`` (n, 2, VIEW_PX, VIEW_PX): the image and the design in the frame of the patch. The design is blurred
-        by ``blur_px``. Image and design are 0 at pixels outside the image. ``evidence`` (n, columns).
+        ``view`` has the shape (n, 2, VIEW_PX, VIEW_PX): the image and the design in the frame of the patch. The design
+        is blurred by ``blur_px``. Both are 0 at pixels outside the image. ``evidence`` has the shape (n, columns).
     """
     design = build_templates(patches).view[hypotheses.design]
     soft = np.flatnonzero(hypotheses.blur_px)

@@ -21,7 +21,7 @@ class InferenceSession(Protocol):
     """A network that is ready to run: ONNX Runtime's ``InferenceSession``, or :class:`OpenVinoSession`."""
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """Return all outputs of the network for inputs by name."""
+        """Return all outputs of the network; ``feed`` maps the name of each input to its values."""
         ...
 
 
@@ -35,7 +35,7 @@ class OpenVinoSession:
         self._compiled = core.compile_model(core.read_model(io.BytesIO(model)), "CPU", settings)
 
     def run(self, outputs: None, feed: dict[str, Float32], /) -> Sequence[Float32]:
-        """Return all outputs of the network for inputs by name."""
+        """Return all outputs of the network; ``feed`` maps the name of each input to its values."""
         results = self._compiled(feed)
         return [np.array(results[output]) for output in self._compiled.outputs]
 
@@ -65,13 +65,13 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     model : bytes
         Content of an ONNX file.
     threads : int
-        Number of threads. 0 means as many as OpenCV may use; in a worker process OpenCV may use one thread.
+        Number of threads. 0 means the number of OpenCV's threads, which is 1 in a worker process.
 
     Returns
     -------
     session : InferenceSession
     metadata : str
-        Text that kpbench wrote into the file, "" in a file without such text.
+        Text that kpbench wrote into the file; "" if the file has no such text.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     if runtime == "cuda" and not runs_on_gpu():
         raise DataError("KPBENCH_RUNTIME is 'cuda', but this ONNX Runtime has no CUDA: install onnxruntime-gpu")
     providers: list[str | tuple[str, dict[str, str]]] = ["CPUExecutionProvider"]
-    if runs_on_gpu():  # the default search would try all algorithms on every new size of image
+    if runs_on_gpu():  # cuDNN's default search would time all algorithms for every new size of image
         providers.insert(0, ("CUDAExecutionProvider", {"cudnn_conv_algo_search": "HEURISTIC"}))
     session = onnxruntime.InferenceSession(model, options, providers=providers)
     metadata = session.get_modelmeta().custom_metadata_map.get("kpbench", "")
@@ -98,4 +98,4 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     try:
         return OpenVinoSession(model, threads or cv2.getNumThreads()), metadata
     except ModuleNotFoundError:
-        raise DataError("KPBENCH_RUNTIME is 'openvino': pip install 'kpbench[openvino]'") from None
+        raise DataError("KPBENCH_RUNTIME is 'openvino', but OpenVINO is missing: pip install 'kpbench[openvino]'") from None

@@ -71,17 +71,18 @@ class LoadedDetector:
     run : callable
         Function of an image.
     board : str, optional
-        Board of tags that the detector looks for (:data:`kpbench.patches.TAG_BOARDS`); None for patches.
+        Board of tags that the detector looks for, see :data:`kpbench.patches.TAG_BOARDS`. None: the detector looks for
+        patches or for points without identity.
     identity : str, optional
         SHA-256 of name, version, settings and weights. Stored detections stay valid while the identity is unchanged.
         None if the detector has no version, or was loaded with ``patches``.
     run_many : callable, optional
-        Function of a sequence of images, for a detector that is faster on several images than on one.
+        Function of a sequence of images, for a detector that needs less time per image on several images.
 
     Raises
     ------
     DataError
-        On a call, if the result is not :class:`Detections`, or has a negative patch ID or a coordinate or score that is
+        On a call, if the result is not :class:`Detections`, if a patch ID is negative, or if a coordinate or a score is
         not finite.
 
     Examples
@@ -130,8 +131,8 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     ----------
     name : str
         One of :data:`DETECTORS`; weights ``FILE.onnx`` written by ``kpbench export-model``; ``MODULE:ATTR``; or
-        ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, a callable object, or
-        a class whose constructor needs no arguments and makes such an object. MODULE may lie in the current folder.
+        ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, or a class of such
+        objects whose constructor needs no arguments. MODULE may lie in the current folder.
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
@@ -154,7 +155,7 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     0
     """
     if patches is not None and name != "template":
-        raise DataError(f"`patches` are for the detector template; {name} has designs of its own")
+        raise DataError(f"`patches` can be given only to the detector template, not to {name}")
     if name.startswith(PROGRAM_PREFIX):
         run_many = partial(run_program, name.removeprefix(PROGRAM_PREFIX).strip())
         return LoadedDetector(name, "unknown", lambda image: run_many([image])[0], run_many=run_many)

@@ -46,7 +46,7 @@ class PredictionRun:
 
 
 ImageResult = tuple[Detections, str]
-"""Detections in an image, and the message of the detector's error, "" without an error."""
+"""Detections in an image, and the error message; the message is "" if the image did not fail."""
 
 
 def predict(
@@ -70,8 +70,8 @@ def predict(
         Detections with a lower score are dropped. A detector given by name gets this threshold in place of its own
         threshold. None keeps all detections.
     workers : int, optional
-        Number of processes; None for one per core. A loaded detector always runs in this process. Images without
-        truth are always processed in this process.
+        Number of processes; None for one per core. A loaded detector always runs in the calling process, and so does
+        any detector on images without truth.
     overlay : Path, optional
         Folder or video file to draw the detections into.
     progress : callable
@@ -84,7 +84,7 @@ def predict(
     Raises
     ------
     DataError
-        If the detector cannot be loaded, it fails on every image, or the dataset cannot be read.
+        If the detector cannot be loaded, the detector fails on every image, or the dataset cannot be read.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def predict_images(
     Raises
     ------
     DataError
-        If the detector cannot be loaded, or it fails on every image.
+        If the detector cannot be loaded or fails on every image.
 
     Examples
     --------
@@ -194,7 +194,7 @@ def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
 
 
 def _user_line(error: BaseException) -> str:
-    """Return file and line of the innermost call outside kpbench that led to an error, "" if no such call did."""
+    """Return file and line of the last call outside kpbench in an error's traceback; "" if all calls are inside."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""

@@ -19,7 +19,7 @@ from kpbench.types import Detections, UInt8
 
 
 def _run(words: Sequence[str], stderr: Path) -> tuple[int, str]:
-    """Run a program; return its exit code, and its standard error with a mark for each byte that is not UTF-8.
+    """Run a program; return its exit code and its standard error. Bytes that are not UTF-8 are replaced by a mark.
 
     Standard error goes to a file, not to a pipe: a process that the program leaves behind would keep a pipe open. If
     kpbench is interrupted, the program and its children are killed.

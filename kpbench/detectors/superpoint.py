@@ -1,8 +1,9 @@
-"""The reference detector: a SuperPoint network with two heads from an ONNX file, decoded with NumPy and OpenCV.
+"""The reference detector: a SuperPoint network from an ONNX file, decoded with NumPy and OpenCV.
 
-The network gives logits for each cell of 8x8 px. :func:`decode` turns the logits into one probability map at full
-resolution. A keypoint is the centre of mass of the probability in a window around a local maximum. The window may cross
-the borders of cells.
+The network divides the image into cells of 8x8 px and has two heads. The detector head gives a logit for each pixel of
+a cell and for "no keypoint". The ID head gives a logit for each design and for "no patch", one set per cell.
+:func:`decode` turns the logits of the detector head into one probability map at full resolution. A keypoint is the
+centre of mass of the probability in a window around a local maximum. The window may cross the borders of cells.
 """
 
 from __future__ import annotations
@@ -31,11 +32,14 @@ CELL_PX = 8
 SCHEMA = "kpbench.superpoint/1"
 """Schema of the metadata in the ONNX file."""
 EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
-"""A cell is empty if the log odds of each pixel against "no keypoint" are below this limit. Most cells are empty."""
+"""A cell is empty if log(p / q) is at most this for every pixel, where p is the probability of the pixel and q the
+probability of "no keypoint". Most cells are empty."""
 
-# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images over
-# training photographs: notebook/training-log.md, "Weaker places, longer ellipses, and judges on their poses" and "Fewer
-# looks, and what ten thousand more images were worth". The source of MERGE_DISTANCE_PX and DISC_SHARE is not recorded.
+# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images whose
+# backgrounds are training photographs. The measurements are in two sections of notebook/training-log.md:
+# - "Weaker places, longer ellipses, and judges on their poses"
+# - "Fewer looks, and what ten thousand more images were worth"
+# The source of MERGE_DISTANCE_PX and DISC_SHARE is not recorded.
 CANDIDATE_SCORE = 0.015
 """Least network score of a place that is verified."""
 SCALES = (1.2, 0.5, 0.25)
@@ -43,9 +47,9 @@ SCALES = (1.2, 0.5, 0.25)
 VERIFIED_THRESHOLD = 0.3
 """Least score of a verified detection."""
 MERGE_DISTANCE_PX = 3.0
-"""If two candidates are nearer than this, px, only the better is kept. Two scales may find one keypoint twice."""
+"""If two candidates are nearer than this, px, only the better is kept, as two scales may find the same keypoint."""
 DISC_SHARE = 0.6
-"""If two detections are nearer than this, in short semi-axes of the likelier, only the likelier is kept."""
+"""If two detections are nearer than this, in short semi-axes of the better detection, only the better is kept."""
 
 
 @dataclass(frozen=True)
@@ -58,11 +62,11 @@ class Decoding:
         Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
         A threshold below 0.01 still misses some keypoints, as the pixels of empty cells count as 0.
     separation_px : int
-        If two maxima are nearer than this, px, only the better is kept. The default keeps both centres of two discs
-        side by side whose short axes are at least 10 px long.
+        If two maxima are nearer than this, px, only the better is kept. With the default, two discs side by
+        side keep both centres if their short axes are at least 10 px long.
     window_px : int
         Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The score is the sum of
-        the probability in the window. The place is the centre of mass.
+        the probability in the window. The place is the centre of mass of this probability.
 
     Examples
     --------
@@ -91,7 +95,7 @@ def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | No
     Returns
     -------
     Detections
-        ``xy`` in px of the (8h, 8w) image, best first. ``patch_id`` is the channel of the ID head.
+        ``xy`` in px of the (8h, 8w) image, best first. ``patch_id`` is the index of the ID head's likeliest design.
 
     Examples
     --------
@@ -115,7 +119,7 @@ def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
     side = 2 * decoding.separation_px - 1
     highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
     width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
-    # if the sum of a window reaches the threshold, the maximum is at least threshold / width²; 0.5 allows for smoothing
+    # a window whose sum reaches the threshold has a pixel of at least threshold / width²; 0.5 allows for the smoothing
     found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
     found = found[ranked.ravel()[found] >= highest.ravel()[found]]
     rows, columns = np.divmod(found, probability.shape[1])
@@ -147,7 +151,9 @@ def identify(id_logits: Float32, xy: Float) -> Float:
 
 
 def keypoint_probability(detector_logits: Float32) -> Float32:
-    """Return the softmax of detector logits (65, h, w) over each cell as an image (8h, 8w); 0 in empty cells.
+    """Return the probability (8h, 8w) of a keypoint at each pixel, from detector logits (65, h, w).
+
+    The probabilities of a cell are the softmax of its logits. All probabilities of an empty cell are set to 0.
 
     Examples
     --------
@@ -167,7 +173,10 @@ def keypoint_probability(detector_logits: Float32) -> Float32:
 
 
 def _interpolate_cells(cells: Float32, xy: Float) -> Float:
-    """Return bilinear values (n, C) of a map of cells (C, h, w) at places (n, 2) px; cell i is centred at 3.5 + 8i."""
+    """Interpolate a map of cells (C, h, w) bilinearly at places (n, 2) px. Return the values (n, C).
+
+    Cell i is centred at 3.5 + 8i px.
+    """
     _, h, w = cells.shape
     u = np.clip((xy - (CELL_PX - 1) / 2) / CELL_PX, 0, (w - 1, h - 1))
     low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
@@ -196,8 +205,8 @@ class SuperPointDetector:
     Attributes
     ----------
     path : Path, optional
-        ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, in 8-bit integers on a
-        processor, in float32 on a GPU.
+        ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, as 8-bit integers on a
+        CPU and as float32 on a GPU.
     threshold : float, optional
         Least score of a detection, in [0, 1]. None: 0.3 if candidates are verified, else 0.5.
     verified : bool
@@ -205,7 +214,7 @@ class SuperPointDetector:
         centre, identity and score. False: the network alone decides, at the image's own scale. A design without an
         edge at its centre cannot be verified; ``verified`` becomes False if the file has such a design.
     threads : int
-        Threads of the networks; 0 means as many as OpenCV may use.
+        Threads of the networks. 0 means the number of OpenCV's threads.
     scales : tuple of float
         Scales of the image that the network sees, if candidates are verified.
     shipped : str
@@ -270,7 +279,7 @@ class SuperPointDetector:
     detect = __call__
 
     def batch(self, images: Sequence[UInt8]) -> list[Detections]:
-        """Return the detections in each of several images of one size. At each scale, the network runs once.
+        """Return the detections in each of several images of one size. The network runs once per scale on all images.
 
         Raises
         ------

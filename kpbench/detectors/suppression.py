@@ -44,6 +44,6 @@ def suppress(xy: Float, score: Float, distance_px: float | Float) -> Int:
         near = np.hypot(*(xy[order[better]] - xy[order[worse]]).T) < reach[better]
         by_rank = np.flatnonzero(near)[np.argsort(better[near], kind="stable")]
         for one, other in zip(better[by_rank].tolist(), worse[by_rank].tolist(), strict=True):
-            if kept[one]:  # all points better than this one have been visited
+            if kept[one]:  # all points better than `one` have been visited
                 kept[other] = False
     return order[kept]

@@ -1,4 +1,4 @@
-"""Detectors of tags, for comparison with patches: one for each board of :data:`kpbench.patches.TAG_BOARDS`.
+"""Detectors of tags, for comparison with patches: one detector for each board of :data:`kpbench.patches.TAG_BOARDS`.
 
 Settings are the libraries' defaults, except for the settings named below. These exceptions favour the tags. They were
 chosen on scenes whose seed differs from the benchmark's seed (docs/explanation/fairness-to-tags.md). The detectors of
@@ -18,7 +18,8 @@ from kpbench.types import Detections, UInt8
 APRILTAG_DECIMATION = 1.5
 """Factor by which the AprilTag library shrinks the image. The library detects fewer tags with a factor of 1 or 2."""
 LEAST_APRILTAG_SIDE_PX = 8
-"""Least shorter side of an image, px. A smaller image has no detections, as the library crashes on tiny images."""
+"""The shorter side of an image must have at least this many px. A smaller image has no detections, as the library
+crashes on tiny images."""
 
 
 class ArucoDetector:
@@ -74,7 +75,7 @@ class AprilTagDetector:
         if not found:
             return Detections.none()
         # The library puts (0, 0) on the outer corner of the top-left pixel. The board is drawn from OpenCV's
-        # dictionary, in which the tags are upside down: OpenCV's order of corners is the library's rb, lb, lt, rt.
+        # dictionary, in which the tags are upside down. OpenCV's first corner is therefore the library's right bottom (rb).
         xy = np.concatenate([tag["lb-rb-rt-lt"][[1, 0, 3, 2]] for tag in found]) - 0.5
         score = np.repeat([tag["margin"] for tag in found], 4)
         return Detections(xy, score, np.concatenate([4 * tag["id"] + np.arange(4) for tag in found]))

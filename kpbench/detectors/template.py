@@ -1,12 +1,14 @@
 """A classical detector, which needs no training, for any design with straight edges that cross at its centre.
 
 1. Crossings (:func:`find_crossings`). A straight edge through a point stays straight under any perspective. Gradients
-   on this edge are perpendicular to the edge. A pixel is a crossing if each gradient around the pixel is perpendicular
-   to the line from its place to the pixel, and the gradients have more than one direction. This is a form of the
-   operator of Förstner and Gülch, *A fast operator for detection and precise location of distinct points, corners and
-   centres of circular features*, 1987. The operator needs no templates. A few hundred places remain.
+   on this edge are perpendicular to the edge. A pixel is a crossing if two conditions hold. First, each gradient around
+   the pixel is perpendicular to the line from the gradient's place to the pixel. Second, the gradients have more than
+   one direction. This is a form of the operator of Förstner and Gülch, *A fast operator for detection and precise
+   location of distinct points, corners and centres of circular features*, 1987. The operator needs no templates. In an
+   image, a few hundred places remain.
 2. Poses (:mod:`kpbench.fitting.sector_search`, :mod:`kpbench.fitting.align`). The designs are compared with the image
-   at each place, from coarse to fine. Each stage keeps fewer poses than the stage before.
+   at each place: first their cores, which are the innermost sectors, then the whole designs. Each stage keeps fewer
+   poses than the stage before.
 3. Fit (:mod:`kpbench.fitting.design_fit`). The designs are fitted to the pixels, from the remaining poses.
 """
 
@@ -39,11 +41,11 @@ class Thresholds:
     Attributes
     ----------
     window_px : float
-        Standard deviation of the window of :func:`find_crossings`, px of a pyramid level. Gradients at distances of 1
-        to 3 px have the most weight.
+        Standard deviation of the window of :func:`find_crossings`, px of a pyramid level. Gradients 1 to 3 px from a
+        pixel have the most weight.
     radial : float
-        Weight of the gradients that point towards the place or away from the place. These gradients lower the strength
-        of a crossing.
+        Weight of the gradients that point towards a pixel or away from the pixel. These gradients lower the pixel's
+        strength as a crossing.
     octaves : int
         Number of levels of the pyramid in which crossings are searched.
     px_per_place, places : int
@@ -51,10 +53,10 @@ class Thresholds:
     margin : float
         A design is dropped at a place if its correlation is lower than the best design's correlation by more than this.
     search_ncc : float
-        Least correlation near the centre after the search.
+        Least correlation of the core with the image after the search.
     align_steps, align_ncc : tuple
-        The core is aligned in three rounds. ``align_steps`` are the Gauss-Newton steps per round, ``align_ncc`` the
-        least correlations after the rounds.
+        The core is aligned in three rounds. ``align_steps`` holds the number of Gauss-Newton steps of each round.
+        ``align_ncc`` holds the least correlation after each round.
     align_radius : float
         The core is aligned in the coarsest level in which its short semi-axis measures at least this many times
         ``CORE_RADIUS_PX``.
@@ -95,22 +97,22 @@ class Thresholds:
 class ScoreWeights:
     """Weights of the score: a logistic regression on five measures of a candidate.
 
-    Source: fitted to candidates in synthetic images over training photographs, under every deterioration of the paper.
-    A candidate with the right design within a tenth of the radius from a true centre was right. A candidate on no patch
-    was wrong. All other candidates were left out.
+    The weights were fitted to candidates in synthetic images, under every deterioration of the paper. The backgrounds
+    were training photographs. A candidate with the right design, within a tenth of the radius from a true centre, was
+    labelled right. A candidate on no patch was labelled wrong. All other candidates were left out.
 
     Attributes
     ----------
     offset : float
         Log odds where all measures are 0.
     core, whole : float
-        Weights of log(1.01 − correlation), for the correlations near the centre and over the disc.
+        Weights of log(1.01 − correlation), for the correlations of the core and of the whole design.
     unexplained : float
-        Weight of the log of the ratio of the fit's residuals beyond the image's noise to the contrast.
+        Weight of log(√(residual² − noise²) / contrast + 0.02): the fit's residuals beyond the image's noise.
     blur : float
         Weight of the blur, in short semi-axes.
     contrast : float
-        Weight of the log of the ratio of the contrast to the image's range of grey levels.
+        Weight of log(contrast / (range + 5)), with the range of the image's grey levels.
     """
 
     offset: float = -12.55
@@ -150,7 +152,7 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
     moments = [weight / weight.sum() * q**n for n in range(3)]
 
     def moment(image: Float32, nx: int, ny: int) -> Float32:
-        """Return at each p the sum over q of w(q) qx^nx qy^ny image(p + q)."""
+        """Return at each pixel p the sum over q of w(q) qx^nx qy^ny image(p + q)."""
         return np.asarray(cv2.sepFilter2D(image, cv2.CV_32F, moments[nx], moments[ny]))
 
     xx, xy, yy = gx * gx, gx * gy, gy * gy
@@ -174,14 +176,14 @@ def find_crossings(level: Float32) -> tuple[Float, Float]:
 
 @dataclass(frozen=True)
 class Candidates:
-    """The n fits of one image, before fits that overlap better fits and fits with low scores are removed.
+    """The n fits of one image, including fits with low scores and fits that overlap better fits.
 
     Attributes
     ----------
     design : ndarray of shape (n,), int64
         Index of the design.
     core_ncc, whole_ncc : ndarray of shape (n,)
-        Correlations near the centre and over the disc, before the fit.
+        Correlations of the core and of the whole design with the image, before the fit.
     fit : Fit
     noise : float
         Standard deviation of the image's noise, grey levels.
@@ -198,7 +200,7 @@ class Candidates:
 
     @property
     def score(self) -> Float:
-        """Probability (n,) that each candidate is a patch, by :class:`ScoreWeights`."""
+        """Probability (n,) that each candidate is right, by :class:`ScoreWeights`."""
         contrast = np.maximum(self.fit.white - self.fit.black, 1.0)
         unexplained = np.sqrt(np.maximum(self.fit.noise**2 - self.noise**2, 0)) / contrast
         relative_blur = np.minimum(self.fit.blur_px / np.maximum(short_semi_axis(self.fit.A), 0.5), 1)
@@ -302,7 +304,7 @@ def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:
 
 
 def _select_distinct(poses: Poses) -> Int:
-    """Return the indices of the kept poses; the poses come best first.
+    """Return the indices of the kept poses; the given poses are sorted, best first.
 
     A pose near a better pose is kept only if it has another design and a correlation that is nearly as high.
     """
@@ -319,7 +321,10 @@ def _select_distinct(poses: Poses) -> Int:
 
 
 def _select_uncovered(xy: Float, A: Float) -> Int:
-    """Return the indices of the points outside the discs of all better kept points; the points come best first."""
+    """Return the indices of the kept points; the given points are sorted, best first.
+
+    A point is dropped if it lies in the disc of a better point that is kept.
+    """
     offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
     inside = np.linalg.norm(offset, axis=2) < TEMPLATE_THRESHOLDS.disc_share
     kept = np.zeros(len(xy), bool)

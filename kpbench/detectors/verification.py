@@ -1,20 +1,24 @@
 """Verification of a network's candidates on the pixels: is there a patch, of which design, and where is its centre?
 
-A candidate is a place with a score and with probabilities of the designs. The verification works in five steps.
+A candidate is a place that the reference network found (:mod:`kpbench.detectors.superpoint`). The network's detector
+head gives the place and its score. The network's ID head gives the probability of each design and of no patch. The
+verification works in five steps.
 
-1. Ellipses (:func:`find_ellipses`). A small network sees the surroundings of each place. It gives the ellipse that a
-   patch at this place would fill, and the log odds that the place lies on a patch.
+1. Ellipses (:func:`find_ellipses`). A small network, the ellipse network, sees the surroundings of each place. The
+   ellipse network gives the ellipse that a patch at this place would fill, and the log odds that the place lies on a
+   patch.
 2. Poses (:func:`propose_poses`). The likely designs are rotated within the ellipse until they agree best with the
    image. A place with a design and a pose is a hypothesis.
 3. First judge (:func:`judge`). A small network sees each hypothesis: the image in the frame of the patch, the design,
-   and measured :class:`~kpbench.detectors.hypotheses.Evidence`. It gives the log odds that the hypothesis is right, and
-   corrects the pose. Likely hypotheses are shown to the judge once more, in the corrected pose (:func:`look_again`).
+   and measured :class:`~kpbench.detectors.hypotheses.Evidence`. The judge gives the log odds that the hypothesis is
+   right, and corrects the pose. Likely hypotheses are measured again in the corrected pose (:func:`look_again`), and
+   the first judge sees them a second time.
 4. Fit (:func:`fit_hypotheses`). The design is fitted to the pixels (:func:`kpbench.fitting.fit`).
-5. Second judge (:func:`judge`). A small network sees the fitted hypothesis. The evidence now also compares the
-   hypothesis with the other patches of the image, as the patches of an image have similar blur and contrast. The log
-   odds of the second judge are the result.
+5. Second judge (:func:`judge`). Another small network sees the fitted hypothesis. The patches of an image have similar
+   blur and contrast, so the evidence now also compares the hypothesis with the other likely hypotheses of the image.
+   The log odds of the second judge give the score of the detection.
 
-:mod:`kpbench.training.verifier` trains the three networks on synthetic images.
+:mod:`kpbench.training.verifier` trains the ellipse network and the two judges on synthetic images.
 """
 
 from __future__ import annotations
@@ -53,15 +57,17 @@ WEIGHTS = Path(__file__).parent / "weights"
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 """Names of the networks, without ``.onnx``."""
 
-# The limits were chosen on synthetic images over training photographs. notebook/training-log.md has the figures, most
-# of them in "Specks, sizes, and how many places an image has" and in "Fewer looks, and what ten thousand more images
-# were worth".
+# The limits were chosen on synthetic images whose backgrounds are training photographs. Most of the measurements are in
+# two sections of notebook/training-log.md:
+# - "Specks, sizes, and how many places an image has"
+# - "Fewer looks, and what ten thousand more images were worth"
 ID_MARGIN = 3.0
-"""A design is tried if its log probability from the ID head is within this margin of the likeliest design's."""
+"""A design is tried if its log probability, by the ID head, is at most this much below the likeliest design's."""
 ALL_DESIGNS_LOG_ODDS = 0.0
-"""With at least these log odds from the ellipse network, all designs are tried, whatever the ID head says."""
+"""At a place with at least these log odds from the ellipse network, all designs are tried."""
 THOROUGH_LOG_ODDS = -4.8
-"""With at least these log odds from the ellipse network, other ellipse sizes and a second rotation are tried."""
+"""At a place with at least these log odds from the ellipse network, ellipses of other sizes are tried, and a design may
+keep two rotations."""
 LEAST_ELLIPSE_LOG_ODDS = -6.5
 """A place with lower log odds from the ellipse network is dropped."""
 SECOND_LOOK_LOG_ODDS = -5.0
@@ -69,20 +75,26 @@ SECOND_LOOK_LOG_ODDS = -5.0
 LEAST_FIT_LOG_ODDS = -3.5
 """A hypothesis with lower log odds at the second look is not fitted."""
 LARGEST_FIT_MOVE = 0.1
-"""If a fit moves the centre further than this, in short semi-axes, the earlier pose is kept: it is right more often."""
+"""If a fit moves the centre further than this, in short semi-axes, the pose before the fit is kept. After such a move,
+the pose before the fit is right more often."""
 USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. The judges' log odds apply to such images."""
+"""Number of candidates in a typical training image of 640x480 px. In an image with n candidates, where n is larger,
+log(n / USUAL_PLACES) is subtracted from the second judge's log odds."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
-"""Grey levels. Hypotheses need a larger half contrast. In the evidence, lower contrasts of fits are raised to this."""
+"""Lower limit of two contrasts, grey levels.
+
+- A hypothesis is dropped if (white - black) / 2 is at most this limit before the fit.
+- A contrast white - black below this limit, after the fit, is raised to the limit in the evidence.
+"""
 PLACES_PER_BLOCK = 2**11
-"""Largest number of places that the ellipse network sees in one call. The limit bounds the memory."""
+"""Largest number of places that the ellipse network sees in one call. This limits the memory use."""
 
 
 @dataclass(frozen=True)
 class VerifiedCandidates:
-    """The n candidates that were fitted and are large enough, each with its likeliest design.
+    """The n candidates that passed all steps, each with its likeliest design.
 
     Attributes
     ----------
@@ -124,15 +136,15 @@ def verify_candidates(
     ----------
     grey : ndarray of shape (H, W), uint8
     xy : ndarray of shape (n, 2)
-        Places, px.
+        Places of the candidates, px.
     network_score : ndarray of shape (n,)
-        In [0, 1].
+        Scores of the candidates by the detector head, in [0, 1].
     log_id : ndarray of shape (n, len(patches) + 1)
-        Log probability of each design, and of no patch.
+        Log probability of each design, and in the last column of no patch, by the ID head.
     patches : sequence of Patch
         The designs.
     threads : int
-        Threads of the three networks; 0 means as many as OpenCV may use.
+        Threads of the ellipse network and the judges. 0 means the number of OpenCV's threads.
 
     Returns
     -------
@@ -161,7 +173,7 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # more candidates than usual do not mean more patches, so each candidate is less likely to be a patch
+    # more candidates than usual do not mean more patches, so each candidate is less likely to lie on a patch
     log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
@@ -186,7 +198,7 @@ def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Floa
     centre : ndarray of shape (n, 2)
         px.
     A : ndarray of shape (n, 2, 2)
-        Symmetric map of the unit circle to the ellipse, px.
+        Symmetric map from the unit circle to the ellipse, px.
     log_odds : ndarray of shape (n,)
         Log odds that the place lies on a patch.
     """
@@ -228,7 +240,7 @@ def _clip_log_odds(log_odds: Float32) -> Float:
 def propose_poses(
     pyramids: Pyramids, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
 ) -> Hypotheses:
-    """Return hypotheses of the likely designs at every place that may be a patch.
+    """Return hypotheses: poses of the likely designs at every place that may lie on a patch.
 
     The parameters are described at :func:`verify_candidates`.
     """
@@ -252,7 +264,10 @@ def propose_poses(
 
 
 def look_again(pyramids: Pyramids, corrected: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
-    """Return hypotheses whose poses a judge has corrected, with view and evidence for the corrected poses."""
+    """Measure views and evidence again, in the poses that a judge has corrected.
+
+    Hypotheses of low contrast are left out.
+    """
     templates = build_templates(patches)
     poses = Poses(corrected.xy, corrected.A, corrected.design, np.zeros(len(corrected)))
     poses = align_poses(pyramids.smooth, poses, templates.whole, 0, WHOLE_RADIUS_PX)
@@ -263,9 +278,9 @@ def look_again(pyramids: Pyramids, corrected: Hypotheses, patches: Sequence[Patc
 def _measure(
     pyramids: Pyramids, place: Int, place_xy: Float, poses: Poses, of_networks: Float, templates: DesignTemplates
 ) -> Hypotheses:
-    """Return the hypotheses of some poses with their views and evidence; hypotheses of low contrast are left out.
+    """Turn poses into hypotheses by measuring their views and evidence. Hypotheses of low contrast are left out.
 
-    ``of_networks`` (n, 4) is the evidence of the networks: the columns before ``Evidence.NCC``.
+    ``of_networks`` (n, 4) holds the evidence from the networks, which are the columns before ``Evidence.NCC``.
     """
     view, half_contrast = rectify(pyramids.smooth, poses.xy, poses.A, poses.design, templates)
     minor = clipped_semi_axis(poses.A)
@@ -281,10 +296,10 @@ def _measure(
 
 
 def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patches: Sequence[Patch]) -> Hypotheses:
-    """Return hypotheses in the poses that fit the pixels best, with the evidence of the fit.
+    """Fit the designs of hypotheses to the pixels, and add the evidence of the fit.
 
-    A hypothesis keeps its pose if the fit moved the centre further than ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) come
-    from the first judge.
+    The returned hypotheses have the fitted poses. A hypothesis keeps its pose if the fit moved the centre further than
+    ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) come from the first judge.
     """
     fits = fit(pyramids.raw, before.xy, before.A, [patches[n] for n in before.design])
     contrast, minor = np.maximum(fits.white - fits.black, LEAST_CONTRAST), clipped_semi_axis(fits.A)
@@ -311,7 +326,10 @@ def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patc
 
 
 def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Float) -> Float:
-    """Compare each hypothesis with the likely hypotheses elsewhere in the image.
+    """Compare each hypothesis with the hypotheses elsewhere in the image.
+
+    A hypothesis is elsewhere if the distance of the two centres is larger than the short semi-axis of the hypothesis
+    that is compared. Let p be the probability, by the first judge, that a hypothesis is right.
 
     Parameters
     ----------
@@ -323,10 +341,10 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
     Returns
     -------
     ndarray of shape (n, 2 + k)
-        Column 0: log of 1 + the expected number of right hypotheses elsewhere. Column 1: log of 1 + the expected number
-        of wrong hypotheses elsewhere. Other columns: difference of each column of ``shared`` from its mean over the
-        hypotheses elsewhere, weighted by their probabilities. The difference tends to 0 as the expected number of right
-        hypotheses tends to 0.
+        Column 0 is log(1 + R), where R is the sum of p over the hypotheses elsewhere. Column 1 is log(1 + W), where W
+        is the sum of 1 - p over the hypotheses elsewhere. Column 2 + j is R / (R + 0.3) · (s - m), where s is column j
+        of ``shared``, and m is the mean of s over the hypotheses elsewhere, with the weights p. The factor R / (R + 0.3)
+        shrinks the difference towards 0 if few right hypotheses are expected elsewhere.
     """
     right = 1 / (1 + np.exp(-log_odds))
     elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]
@@ -337,14 +355,14 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
 
 
 def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
-    """Judge hypotheses by ``FIRST_JUDGE`` or ``SECOND_JUDGE``.
+    """Run a judge, ``FIRST_JUDGE`` or ``SECOND_JUDGE``, on hypotheses.
 
     Returns
     -------
     log_odds : ndarray of shape (n,)
         Log odds that there is a patch of this design and that the centre is right.
     corrected : Hypotheses
-        The same hypotheses, with the poses that the judge corrected.
+        The same hypotheses, in the poses that the judge corrected.
     """
     if not len(hypotheses):
         return np.zeros(0), hypotheses
@@ -354,7 +372,10 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
 
 
 def verifier_version(*candidate_settings: object) -> str:
-    """Return :data:`VERIFIER` with the first 8 digits of a SHA-256 of the weights and the candidates' settings."""
+    """Return the version of the method and a digest of weights and settings, such as "v7-0123abcd".
+
+    The digest is the first 8 hexadecimal digits of a SHA-256 of the three networks and of ``candidate_settings``.
+    """
     weights = [(WEIGHTS / f"{name}.onnx").read_bytes() for name in (ELLIPSE, FIRST_JUDGE, SECOND_JUDGE)]
     digest = hashlib.sha256(b"".join([*weights, repr(candidate_settings).encode()])).hexdigest()
     return f"v{VERIFIER}-{digest[:8]}"
@@ -370,7 +391,7 @@ def _open(network: str, threads: int) -> InferenceSession:
 
 
 def _contrast_evidence(contrast: Float, pyramids: Pyramids) -> list[Float]:
-    """Return the logs of the ratios of contrasts (n,) to the image's range of grey levels and to the image's noise."""
+    """Return log(contrast / (grey range + 5)) and log(contrast / (noise + 1)) for contrasts (n,) in one image."""
     return [np.log(contrast / (pyramids.grey_range + 5)), np.log(contrast / (pyramids.noise + 1))]
 
 
