@@ -21,8 +21,8 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int
 
 MERGE_DISTANCE = 0.2
-"""Of two hypotheses of one design, the less likely is dropped if the centres are nearer than this, in short semi-axes of
-the likelier hypothesis."""
+"""Of two hypotheses of one design, the less likely is dropped if the centres are nearer than this, in short semi-axes
+of the likelier hypothesis."""
 
 
 class Evidence(IntEnum):
@@ -54,7 +54,7 @@ class Evidence(IntEnum):
     FIT_NCC = 9
     """-log(1.01 - correlation of the fitted design with the image)."""
     FIT_UNEXPLAINED = 10
-    """log(√(residual² - noise²) / contrast): the fit's residuals beyond the image's noise."""
+    """log(√(residual² - noise²) / contrast), with the standard deviations of the fit's residuals and of the noise."""
     FIT_BLUR = 11
     """Standard deviation of the blur, in short semi-axes."""
     FIT_SHIFT = 12

@@ -98,4 +98,6 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     try:
         return OpenVinoSession(model, threads or cv2.getNumThreads()), metadata
     except ModuleNotFoundError:
-        raise DataError("KPBENCH_RUNTIME is 'openvino', but OpenVINO is missing: pip install 'kpbench[openvino]'") from None
+        raise DataError(
+            "KPBENCH_RUNTIME is 'openvino', but OpenVINO is not installed: pip install 'kpbench[openvino]'"
+        ) from None

@@ -77,7 +77,7 @@ class LoadedDetector:
         SHA-256 of name, version, settings and weights. Stored detections stay valid while the identity is unchanged.
         None if the detector has no version, or was loaded with ``patches``.
     run_many : callable, optional
-        Function of a sequence of images, for a detector that needs less time per image on several images.
+        Function of a sequence of images, for a detector that takes less time per image if it gets several images.
 
     Raises
     ------

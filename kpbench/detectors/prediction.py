@@ -194,7 +194,7 @@ def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
 
 
 def _user_line(error: BaseException) -> str:
-    """Return file and line of the last call outside kpbench in an error's traceback; "" if all calls are inside."""
+    """Return file and line of the last call outside kpbench in an error's traceback; "" if kpbench made all calls."""
     frames = traceback.extract_tb(error.__traceback__)
     own = [frame for frame in frames if PACKAGE not in Path(frame.filename).parents]
     return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""

@@ -35,8 +35,8 @@ EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
 """A cell is empty if log(p / q) is at most this for every pixel, where p is the probability of the pixel and q the
 probability of "no keypoint". Most cells are empty."""
 
-# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images whose
-# backgrounds are training photographs. The measurements are in two sections of notebook/training-log.md:
+# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images with
+# training photographs as backgrounds. The measurements are in two sections of notebook/training-log.md:
 # - "Weaker places, longer ellipses, and judges on their poses"
 # - "Fewer looks, and what ten thousand more images were worth"
 # The source of MERGE_DISTANCE_PX and DISC_SHARE is not recorded.
@@ -62,8 +62,8 @@ class Decoding:
         Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
         A threshold below 0.01 still misses some keypoints, as the pixels of empty cells count as 0.
     separation_px : int
-        If two maxima are nearer than this, px, only the better is kept. With the default, two discs side by
-        side keep both centres if their short axes are at least 10 px long.
+        If two maxima are nearer than this, px, only the better is kept. With the default, the centres of two discs side
+        by side are both kept if the short axes of the discs are at least 10 px long.
     window_px : int
         Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The score is the sum of
         the probability in the window. The place is the centre of mass of this probability.

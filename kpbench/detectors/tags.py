@@ -75,7 +75,8 @@ class AprilTagDetector:
         if not found:
             return Detections.none()
         # The library puts (0, 0) on the outer corner of the top-left pixel. The board is drawn from OpenCV's
-        # dictionary, in which the tags are upside down. OpenCV's first corner is therefore the library's right bottom (rb).
+        # dictionary, in which the tags are upside down. OpenCV's first corner, the top left, is therefore the library's
+        # right bottom (rb).
         xy = np.concatenate([tag["lb-rb-rt-lt"][[1, 0, 3, 2]] for tag in found]) - 0.5
         score = np.repeat([tag["margin"] for tag in found], 4)
         return Detections(xy, score, np.concatenate([4 * tag["id"] + np.arange(4) for tag in found]))

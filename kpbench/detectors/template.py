@@ -108,7 +108,8 @@ class ScoreWeights:
     core, whole : float
         Weights of log(1.01 − correlation), for the correlations of the core and of the whole design.
     unexplained : float
-        Weight of log(√(residual² − noise²) / contrast + 0.02): the fit's residuals beyond the image's noise.
+        Weight of log(√(residual² − noise²) / contrast + 0.02), with the standard deviations of the fit's residuals and
+        of the image's noise.
     blur : float
         Weight of the blur, in short semi-axes.
     contrast : float

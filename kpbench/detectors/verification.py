@@ -57,7 +57,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 """Names of the networks, without ``.onnx``."""
 
-# The limits were chosen on synthetic images whose backgrounds are training photographs. Most of the measurements are in
+# The limits were chosen on synthetic images with training photographs as backgrounds. Most of the measurements are in
 # two sections of notebook/training-log.md:
 # - "Specks, sizes, and how many places an image has"
 # - "Fewer looks, and what ten thousand more images were worth"
@@ -343,8 +343,8 @@ def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Fl
     ndarray of shape (n, 2 + k)
         Column 0 is log(1 + R), where R is the sum of p over the hypotheses elsewhere. Column 1 is log(1 + W), where W
         is the sum of 1 - p over the hypotheses elsewhere. Column 2 + j is R / (R + 0.3) · (s - m), where s is column j
-        of ``shared``, and m is the mean of s over the hypotheses elsewhere, with the weights p. The factor R / (R + 0.3)
-        shrinks the difference towards 0 if few right hypotheses are expected elsewhere.
+        of ``shared``, and m is the mean of s over the hypotheses elsewhere, weighted by p. The factor R / (R + 0.3) is
+        near 0 if few right hypotheses are expected elsewhere.
     """
     right = 1 / (1 + np.exp(-log_odds))
     elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]

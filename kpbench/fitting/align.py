@@ -25,13 +25,14 @@ from kpbench.fitting.templates import DesignTemplates, Templates
 from kpbench.types import Float, Float32, Int
 
 AMBIGUOUS_NCC = 0.15
-"""A second rotation is kept if its correlation with the image is within this margin of the best correlation."""
+"""A second rotation is kept if its correlation with the image is less than this below the best correlation."""
 DISTINCT_NCC = 0.5
 """Two rotations of a design are distinct if their templates correlate by less than this."""
 RADIUS_FACTORS = (0.8, 0.9, 1.1)
-"""Factors of an ellipse's size that are tried besides 1, as rings or the ground may have biased the given size."""
+"""Factors by which the given size of an ellipse is multiplied. Each product is tried besides the given size. Rings or
+the ground may have biased the given size."""
 WHOLE_RADIUS_PX = 5.6
-"""The whole design is compared in the coarsest level in which its short semi-axis measures at least this, px."""
+"""A whole design is compared in the coarsest pyramid level in which its short semi-axis is at least this many px."""
 LARGEST_STEP = 0.35
 """Largest change of a parameter in one Gauss-Newton step; a longer step is shortened."""
 
@@ -95,7 +96,7 @@ def rotate_within_ellipse(
         Index of the design that is rotated.
     templates : DesignTemplates
     thorough : ndarray of shape (N,), bool, optional
-        Whether other sizes of an ellipse and a second rotation are tried. None: for all ellipses.
+        Ellipses for which other sizes are tried and a second rotation may be kept. None: all ellipses.
 
     Returns
     -------
@@ -123,7 +124,7 @@ def rotate_within_ellipse(
 
 
 def _correlate_rotations(levels: Sequence[Float32], xy: Float, A: Float, design: Int, whole: Templates) -> Float32:
-    """Return the correlations (N, R) of ellipses with all rotations; -inf for rotations of other designs."""
+    """Return the correlations (N, R) of N ellipses with all R rotations; -inf for rotations of other designs."""
     values = sample_pyramid(levels, choose_level(short_semi_axis(A), WHOLE_RADIUS_PX, levels), xy, A, whole.points)
     ncc = normalise_rows(values) @ whole.rotated.T
     cut, outside = find_samples_outside(levels[0], xy, A, whole.points)
@@ -175,7 +176,7 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
     steps : int
         Number of steps. With 0 steps, only the correlation is measured.
     radius_px : float
-        Poses are compared in the coarsest level in which their short semi-axis measures at least this.
+        A pose is compared in the coarsest level in which its short semi-axis is at least this many px.
 
     Returns
     -------
@@ -192,7 +193,7 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
         delta = np.matmul(solve, residual[..., None])[..., 0].astype(np.float64)
         delta *= np.minimum(1.0, LARGEST_STEP / np.maximum(np.abs(delta).max(axis=1), 1e-9))[:, None]
         stepped = A @ np.linalg.inv(np.eye(2) + delta[:, 2:].reshape(-1, 2, 2))
-        # sectors look the same at every size, so a step in size would only fit the blur: their size is kept
+        # sectors look the same at every size, so a step in size would only fit the blur; the size is kept instead
         kept_size = short_semi_axis(A) / np.maximum(short_semi_axis(stepped), 1e-9)
         A = stepped * np.where(has_size, 1.0, kept_size)[:, None, None]
         xy = xy - np.einsum("nij,nj->ni", A, delta[:, :2])
@@ -200,8 +201,9 @@ def align_poses(levels: Sequence[Float32], poses: Poses, templates: Templates, s
 
 
 def _compare(values: Float32, ink: Float32, cut: Int, outside: NDArray[np.bool_]) -> tuple[Float32, Float32]:
-    """Return the correlations (N,) of grey values with templates, and the residuals (N, M) in units of the ink.
+    """Return the correlations (N,) of grey values with templates, and the residuals (N, M).
 
+    A residual is the grey value minus the template, after the grey values have been shifted and scaled to the template.
     The rows ``cut`` have samples outside the image. These samples do not count in the correlation, and their residual
     is 0.
     """
@@ -218,7 +220,7 @@ def _compare(values: Float32, ink: Float32, cut: Int, outside: NDArray[np.bool_]
         size, spread = (np.einsum("nm,nm->n", part, part) + 1e-6 for part in (model, grey))
         slope = np.einsum("nm,nm->n", grey, model) / size
         spread += LEAST_DEVIATION**2 * count[:, 0]
-        # a pattern with less than half its samples in the image proves little
+        # if less than half of a pattern's samples lie in the image, a high correlation proves little, so it is lowered
         ncc[cut] = slope * np.sqrt(size / spread) * np.minimum(1, 2 * count[:, 0] / inside.shape[1])
         residual[cut] = np.where(inside, grey / np.maximum(slope, 0.3 * np.sqrt(spread))[:, None] - model, 0)
     return ncc, residual

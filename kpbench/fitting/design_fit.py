@@ -1,6 +1,6 @@
 """The design fit: centre, pose, inks and blur of a patch, estimated from the pixels.
 
-:func:`fit` renders the design with exact coverage, blurs it, and changes its unknowns until the rendering and the
+:func:`fit` renders the design with exact coverage, blurs the rendering, and changes the unknowns until rendering and
 pixels agree (Gauss-Newton with robust weights). The unknowns are the centre, the affine map, the perspective, both
 inks and the blur. :mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to start from.
 """
@@ -20,17 +20,20 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
 COARSE_PX, COARSE_STEPS = 30.0, 2
-"""The first ``COARSE_STEPS`` steps use the finest level with a long semi-axis of at most ``COARSE_PX`` px."""
+"""The first ``COARSE_STEPS`` steps use the finest pyramid level in which the patch's long semi-axis, with rim and quiet
+zone, is at most ``COARSE_PX`` px."""
 FINE_PX, FINE_STEPS = 100.0, 3
-"""The last ``FINE_STEPS`` steps use the finest level with a long semi-axis of at most ``FINE_PX`` px."""
+"""The last ``FINE_STEPS`` steps use the finest pyramid level in which this semi-axis is at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
-"""If a step moves a patch by at most this, in short semi-axes, no further step is taken in the same level."""
+"""If a step changes centre and map by at most this, in short semi-axes, no further step is taken in the same level."""
 LEVEL_BLUR_PX = 0.6
 """Standard deviation of the pyramid's own blur in every level but level 0, px of the level."""
 MODEL_REACH = 1.3
-"""The outermost ring is drawn out to this many times its radius, so that its blurred outer edge misses the patch."""
+"""The model draws the outermost ring up to this many times its outer radius. The blurred outer edge of the model then
+lies outside the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
-"""Prior of the perspective: standard deviation of ``bend``, per px of the short semi-axis."""
+"""Prior of the perspective. Each entry of ``_State.bend`` has the standard deviation ``EXPECTED_BEND_PER_PX`` times the
+short semi-axis in px."""
 LEAST_PIXELS = 12
 """A step needs at least this many pixels inside the patch, and at least this many pixels on edges."""
 
@@ -50,7 +53,7 @@ class Fit:
     blur_px : ndarray of shape (N,)
         Standard deviation of the Gaussian blur, px.
     ncc : ndarray of shape (N,)
-        Correlation of model and pixels over the disc, in [-1, 1].
+        Correlation of model and pixels over the patch without a margin at its edge, in [-1, 1].
     noise : ndarray of shape (N,)
         Standard deviation of the residuals, grey levels.
 
@@ -82,8 +85,8 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
     ----------
     levels : list of ndarray
         ``kpbench.fitting.build_pyramid(image, 0)``. The first steps are taken in the level in which the patch's long
-        semi-axis measures 15 to 30 px, the last steps in the level in which it measures 50 to 100 px. For a smaller
-        patch, the steps are taken in the image itself.
+        semi-axis measures 15 to 30 px. The last steps are taken in the level in which the semi-axis measures 50 to 100
+        px. A smaller patch is fitted in the image itself.
     xy, A : ndarray of shape (N, 2) and (N, 2, 2)
         Starting poses, px. The poses must be right to about a tenth of the radius.
     patches : sequence of Patch
@@ -129,9 +132,9 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
 class _State:
     """One patch during the fit, in px of the pyramid level.
 
-    ``window`` is the map that the fit started from. This map, centred at ``xy``, decides which pixels count: the pixels
-    inside the patch's extent, except for a margin at the rim. ``bend`` holds the first two entries of the last row of
-    the homography. ``moved`` is the size of the last step, in short semi-axes.
+    ``window`` is the map that the fit started from. A pixel counts if this map, centred at ``xy``, places the pixel in
+    the patch, further from the patch's edge than a margin. ``bend`` holds the first two entries of the last row of the
+    homography. ``moved`` is the size of the last step, in short semi-axes.
     """
 
     xy: Float
@@ -179,8 +182,8 @@ def _black_polygons(state: _State, patch: Patch) -> list[Float]:
 def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
     """Return the black cells of a design as polygons in the patch frame.
 
-    Coverages of cells are added, so cells that touch leave no seam. ``tolerance`` is the largest distance between arc
-    and polygon, in disc radii.
+    The cells may stay separate: their coverages are added, so touching cells leave no seam. ``tolerance`` is the
+    largest distance between an arc and its polygon, in disc radii.
     """
     radii, angles, black = patch.cells
     radii = np.append(radii[:-1], radii[-1] * MODEL_REACH)
@@ -253,7 +256,8 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, and the square of the
     blur.
     """
-    damped = np.arange(4, 11)  # a design of sectors alone leaves its size and some stretches undetermined
+    # the pixels of a design of sectors alone do not determine its size and some stretches, so damping holds them
+    damped = np.arange(4, 11)
     normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
     normal[[0, 1, 2, 3], [0, 1, 2, 3]] += 1e-3
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2

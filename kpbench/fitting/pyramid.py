@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from kpbench.types import Float, Float32, Int, UInt8
 
 MOST_LEVELS, LEAST_SIDE_PX = 7, 16
-"""Largest number of levels, and least shorter side of a level that is halved again, px."""
+"""A level is halved again if its shorter side is at least ``LEAST_SIDE_PX``, until there are ``MOST_LEVELS`` levels."""
 REMAP_ROWS = 2**14
-"""Largest number of poses that are sampled in one call, as OpenCV's remap takes fewer than 2**15 rows."""
+"""Largest number of poses that are sampled in one call of OpenCV's remap, which takes fewer than 2**15 rows."""
 LEAST_DEVIATION = 1.0
-"""Grey levels. Added in quadrature to standard deviations, so that an even surface has correlations near 0."""
+"""Grey levels that are added in quadrature to standard deviations, so that an even surface has correlations near 0."""
 
 
 def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
-    """Return the octaves of a grey image, finest first.
+    """Return the pyramid of a grey image, finest level first.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, p
 
 
 def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> tuple[Int, NDArray[np.bool_]]:
-    """Return the poses that may have samples outside the image, and mark these samples.
+    """Find the poses that may have samples outside the image, and mark the samples outside.
 
     Parameters
     ----------
@@ -115,6 +115,7 @@ def find_samples_outside(image: Float32, xy: Float, A: Float, points: Float) -> 
     rows : ndarray of shape (K,), int64
         Indices of the poses. A few of these poses may have all samples inside.
     outside : ndarray of shape (K, M), bool
+        Whether each sample of these poses lies outside.
     """
     last = np.array(image.shape[::-1]) - 1.0
     reach = np.linalg.norm(A, axis=2) * np.linalg.norm(points, axis=1).max()
@@ -131,6 +132,6 @@ def normalise_rows(values: Float32) -> Float32:
 
 
 def choose_level(radius_px: Float, least_px: float, levels: Sequence[Float32]) -> Int:
-    """Return the coarsest levels (N,) in which radii (N,), px of the image, measure at least ``least_px`` px."""
+    """Return the coarsest level in which each radius (N,), given in px of the image, is at least ``least_px`` px."""
     octave = np.floor(np.log2(np.maximum(radius_px, 1e-6) / least_px))
     return np.clip(octave, 0, len(levels) - 1).astype(np.int64)

@@ -1,10 +1,12 @@
 """Poses of designs, searched from rough places and scales.
 
-The search uses the innermost sectors of a design, which look the same at every size. :func:`search_sectors` samples
-circles around each place under many tilts. The samples are correlated with the sectors of each design in each rotation.
-:func:`kpbench.fitting.align.align_poses` moves the result onto the image. :func:`estimate_size` then measures how far
-the sectors reach, which gives the size of the patch. :func:`core_symmetries` adds the rotations in which the sectors
-look the same but the whole design does not.
+The search uses the *core* of a design: its innermost sectors, which look the same at every size.
+
+1. :func:`search_sectors` samples circles around each place under many tilts. The largest of these is the core's circle.
+   The samples are correlated with the core of each design in each rotation.
+2. :func:`kpbench.fitting.align.align_poses` moves the poses onto the image.
+3. :func:`estimate_size` measures how far the sectors reach, which gives the size of the patch.
+4. :func:`core_symmetries` adds the rotations in which the core looks the same but the whole design does not.
 """
 
 from __future__ import annotations
@@ -35,7 +37,7 @@ SPOKES = 40
 RING_RADII = 0.7 * 1.12 ** np.arange(34)
 """Radii of the circles of :func:`estimate_size`, in radii of the core's circle."""
 FIRST_RINGS = 12
-"""Number of circles that are sampled first. At most places without a patch, no further circles are needed."""
+"""Number of circles that are sampled first. Places on no patch rarely need further circles."""
 AGREEING_SHARE = 0.7
 """A circle belongs to the patch only if at least this share of its votes is for the predicted ink."""
 VOTING_SHARE = 0.3
@@ -43,7 +45,7 @@ VOTING_SHARE = 0.3
 VOTE_OFFSET = 0.4
 """A sample votes for the predicted ink if its agreement with this ink, from -1 to 1, is larger than this."""
 BLOCK = 2**11
-"""Largest number of poses that are measured together. The limit bounds the memory."""
+"""Largest number of poses that are measured together. This limits the memory use."""
 _TILTS = ((1.0, 1), (0.6, 4), (0.36, 6), (0.22, 9))
 """Tilts that are searched: ratio of short to long semi-axis, and number of directions of the tilt."""
 
@@ -102,9 +104,10 @@ def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemp
     """Measure how far the sectors reach, and turn poses of the core into poses of the unit disc.
 
     Circles of growing size are sampled around each place. Each sample votes for or against the ink that the sectors
-    predict. The ellipse with the largest sum of votes is the outer edge of the sectors. Sectors with edges of two
-    directions look the same when they are stretched along these directions, so ellipses of several stretches are tried.
-    Edges of three or more directions determine the stretch.
+    predict. The ellipse with the largest sum of votes inside is the outer edge of the sectors.
+
+    Sectors with edges of two directions look the same when they are stretched along these directions, so ellipses of
+    several stretches are tried. Edges of three or more directions determine the stretch.
     """
     A = poses.A.copy()
     for rows in np.split(np.arange(len(poses)), range(BLOCK, len(poses), BLOCK)):
@@ -115,7 +118,9 @@ def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemp
 
 
 def core_symmetries(poses: Poses, templates: DesignTemplates) -> tuple[Int, Poses]:
-    """Return the poses in every rotation in which the core looks the same but the whole design differs.
+    """Return each pose in every rotation in which the core looks the same but the whole design differs.
+
+    The given rotation is the first of these rotations.
 
     Returns
     -------
@@ -158,12 +163,12 @@ def _fit_edge(
     for d, patch in enumerate(templates.patches):
         rows = np.flatnonzero(poses.design == d)
         shapes, ends, known = _ellipse_ends(patch, count)
-        # (circles x spokes, poses): sums of votes, votes in favour, all votes
+        # three tables of shape (circles x spokes, poses): sum of votes up to the circle, vote in favour, any vote
         tables = [t[rows].reshape(len(rows), count * SPOKES).T for t in (summed, votes > 0, votes != 0)]
         total, agreeing, cast = (
             (ends @ np.ascontiguousarray(t, np.float32)).T.reshape(len(rows), len(shapes), count) for t in tables
         )
-        # the patch ends at the first circle that disagrees; circles beyond can agree only by chance
+        # the patch ends at the first circle that disagrees; a circle beyond can agree only by chance
         beyond = np.logical_or.accumulate(
             (agreeing < AGREEING_SHARE * cast) | (agreeing < VOTING_SHARE * SPOKES), axis=2
         )
@@ -176,7 +181,10 @@ def _fit_edge(
 
 
 def _vote(levels: Sequence[Float32], poses: Poses, templates: DesignTemplates, count: int) -> Float32:
-    """Return votes (N, circles, spokes), from -1.4 (other ink) to 0.6 (predicted ink); 0 outside the image."""
+    """Return votes (N, circles, spokes) between -1.4, for the other ink, and 0.6, for the predicted ink.
+
+    The vote of a sample outside the image is 0.
+    """
     spokes, radii = _spoke_points(), RING_RADII[:count]
     ink = np.array([look_up_ink(draw_ink(patch, False), spokes) for patch in templates.patches], np.float32)
     predicted = ink[poses.design][:, None]
@@ -208,7 +216,8 @@ def _ellipse_ends(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
     -------
     shapes : ndarray of shape (G, 2, 2)
     ends : sparse array of shape (G · circles, circles · spokes)
-        1 at the samples where the ellipse of a shape and size ends.
+        A row is an ellipse of one shape and size, a column is a sample. The entry is 1 if the ellipse ends at the
+        sample.
     known : int
         Index of the last size at which every ellipse lies within the circles that were sampled.
     """
@@ -229,7 +238,7 @@ def _spoke_points() -> Float:
 
 @lru_cache(maxsize=64)
 def _stretches_along_edges(patch: Patch) -> Float:
-    """Return maps (G, 2, 2) of the patch frame, of determinant 1, that keep the directions of the innermost edges."""
+    """Return maps (G, 2, 2) of the patch frame that keep areas and the directions of the innermost edges."""
     _, angles, black = patch.cells
     edges = np.unique(np.round(angles[black[0] != np.roll(black[0], 1)] % 180.0, 6))
     if len(edges) > 2:

@@ -1,7 +1,8 @@
 """Designs as templates: their inks at sample points, in every rotation.
 
-Two kinds of templates are compared with an image. The *core* is the innermost sectors of a design, which look the same
-at every size. The *whole* is the design out to its rim.
+An ink is a number, 1 for white and -1 for black. Two kinds of templates are compared with an image. The *core* is the
+innermost sectors of a design, which look the same at every size. The *whole* is the design out to the edge of the disc.
+A core is sampled within the core's circle, which may have any radius that the sectors fill.
 """
 
 from __future__ import annotations
@@ -22,13 +23,14 @@ CORE_ROTATIONS = 24
 WHOLE_ROTATIONS = 72
 """Number of rotations of the whole design that are tried: 5 degrees apart, which is close enough for a fit."""
 CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
-"""Radii of the sampled circles: of a core in radii of the core's circle, of a whole design in radii of the disc."""
+"""Radii of the sampled circles. The unit is the radius of the core's circle for a core, and of the disc for a whole
+design."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
-"""Standard deviation of a template's blur, in the units of the radii, to match the smoothing of the image pyramid."""
+"""Standard deviations of the blur of templates, in the units of the rings. The blur matches the smoothing of the pyramid."""
 SAME_NCC = 0.998
 """Two rotations of a design look the same if their templates correlate by at least this. Only the first is kept."""
 VIEW_REACH = 1.7
-"""Half the side of a view, in radii of the disc: a view shows the disc and the ground around the disc."""
+"""Half the side of a view, in radii of the disc. A view shows the disc and the ground around the disc."""
 VIEW_PX = 32
 """Side of a view, px."""
 _INK_PX = 273
@@ -50,7 +52,7 @@ class Templates:
     solve : ndarray of shape (D, 6, M), float32
         Maps a residual to a Gauss-Newton step in (x, y, a11, a12, a21, a22).
     has_size : ndarray of shape (D,), bool
-        Whether the template looks different at another size; sectors look the same.
+        Whether the template looks different at another size. False for sectors alone.
     rotated : ndarray of shape (R, M), float32
         Inks of all designs in all rotations, without rotations that look like an earlier rotation.
     rotated_design : ndarray of shape (R,), int64
@@ -77,7 +79,7 @@ class DesignTemplates:
     patches : tuple of Patch
         The designs.
     core, whole : Templates
-        Innermost sectors, on the unit circle; whole designs, on the unit disc.
+        Templates of the cores, on the unit circle, and of the whole designs, on the unit disc.
     view : ndarray of shape (D, VIEW_PX²), float32
         Each design as :func:`kpbench.fitting.views.rectify` shows it: white 1, black -1.
     """
@@ -132,7 +134,8 @@ def _linearise(image: Float32, points: Float) -> tuple[Float, Float]:
     ink = ink - ink.mean()
     jacobian /= np.linalg.norm(ink)
     ink /= np.linalg.norm(ink)
-    jacobian -= jacobian.mean(axis=0)  # offset and contrast of the grey values are free
+    # offset and contrast of the grey values are unknown, so the step must not depend on them
+    jacobian -= jacobian.mean(axis=0)
     jacobian -= np.outer(ink, ink @ jacobian)
     normal = jacobian.T @ jacobian
     # sectors with two edges look the same when they are stretched along the edges; damping keeps this stretch unchanged
@@ -147,8 +150,8 @@ def draw_ink(patch: Patch, whole: bool) -> Float32:
     ----------
     patch : Patch
     whole : bool
-        True draws the design, with its outermost ring continued outwards. False draws its innermost sectors, continued
-        outwards.
+        True draws the design, with its outermost ring continued outwards. False draws the innermost sectors alone,
+        continued outwards.
     """
     fine = 3
     ticks = ((np.arange(_INK_PX * fine) + 0.5) / (_INK_PX * fine) * 2 - 1) * VIEW_REACH

@@ -14,15 +14,15 @@ from kpbench.types import Float, Float32, Int
 OCTAVES = 4
 """Number of octaves of :func:`sample_surroundings`: squares of 32, 64, 128 and 256 px of the image."""
 INK_LIMIT = 2.5
-"""The inks of a view are clipped to ± this limit; white is 1 and black is -1."""
+"""The inks of a view are clipped to ± this limit. White is 1 and black is -1."""
 HALF_CONTRAST_RANGE = (2.0, 128.0)
-"""Range to which a measured half contrast is clipped, grey levels."""
+"""Range to which a measured half contrast, (white - black) / 2, is clipped, grey levels."""
 
 
 def rectify(
     levels: Sequence[Float32], xy: Float, A: Float, design: Int, templates: DesignTemplates
 ) -> tuple[Float32, Float]:
-    """Return views of the image in the frames of N patches: upright, without tilt, in units of the patch's own inks.
+    """Return views of N patches: the image in the patch frame, with grey levels converted to inks.
 
     Parameters
     ----------
@@ -37,11 +37,12 @@ def rectify(
     Returns
     -------
     views : ndarray of shape (N, VIEW_PX²), float32
-        Inks: white is 1 and black is -1. A line maps grey levels to inks. The line is fitted by least squares to the
-        pixels of the disc. Inks are clipped to ±INK_LIMIT, and nan outside the image.
+        ink = (grey − offset) / half_contrast, so white is 1 and black is -1. ``offset`` and ``half_contrast`` come from
+        a linear regression of the grey level on the design's ink, over the pixels of the disc. Inks are clipped to
+        ±INK_LIMIT. Pixels outside the image are nan.
     half_contrast : ndarray of shape (N,)
-        Half the difference of white and black, grey levels, clipped to ``HALF_CONTRAST_RANGE``. The lower limit is also
-        returned if white is darker than black.
+        (white - black) / 2, grey levels, clipped to ``HALF_CONTRAST_RANGE``. If white is darker than black, the value
+        is therefore the lower limit.
     """
     points = view_points()
     px = short_semi_axis(A) * 2 * VIEW_REACH / VIEW_PX

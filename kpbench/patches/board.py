@@ -19,16 +19,18 @@ from kpbench.geometry.outline import cos_sin_deg
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float
 
-# A board that covers 0.5 % of a 1624 x 1240 px image has a side of 100 px. Its discs are 16 px wide, as in the paper.
+# In the paper, a disc is 16 px wide if its board covers 0.5 % of a 1624 x 1240 px image. A square board then has a side
+# of 100 px, so the diameter is 0.16 of the side.
 HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
-TOUCHING_MM = 1e-6  # tolerated overlap: rounding errors can make patches that touch overlap by less than this
+TOUCHING_MM = 1e-6  # a smaller overlap is accepted: after rounding, two touching patches may seem to overlap
 
 
 class BoardPoint(Protocol):
-    """A keypoint of a board, with the disc that sets the scale of the keypoint.
+    """A keypoint of a board, at the centre of a disc.
 
-    On a board of patches, the disc is the patch without rim and quiet zone.
+    The matching threshold is a fraction of the disc's size in the image. On a board of patches, the disc is the patch without rim
+    and quiet zone.
 
     Examples
     --------
@@ -92,7 +94,7 @@ class BoardKeypoint:
     rotate_deg : float
         Rotation of the patch from +x towards +y.
     diameter_mm : float
-        Diameter of the disc. Rim and quiet zone lie around the disc.
+        Diameter of the disc, without the rim and the quiet zone around the disc.
 
     Examples
     --------
