@@ -26,7 +26,7 @@ CORE_RINGS, WHOLE_RINGS = (0.4, 0.7, 1.0), (0.25, 0.45, 0.65, 0.85)
 """Radii of the sampled circles. The unit is the radius of the core's circle for a core, and of the disc for a whole
 design."""
 CORE_BLUR, WHOLE_BLUR = 0.2, 0.12
-"""Standard deviations of the blur of templates, in the units of the rings. The blur matches the smoothing of the pyramid."""
+"""Standard deviations of the blur of templates, in the units of the rings. They match the smoothing of the pyramid."""
 SAME_NCC = 0.998
 """Two rotations of a design look the same if their templates correlate by at least this. Only the first is kept."""
 VIEW_REACH = 1.7

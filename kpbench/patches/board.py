@@ -29,8 +29,8 @@ TOUCHING_MM = 1e-6  # a smaller overlap is accepted: after rounding, two touchin
 class BoardPoint(Protocol):
     """A keypoint of a board, at the centre of a disc.
 
-    The matching threshold is a fraction of the disc's size in the image. On a board of patches, the disc is the patch without rim
-    and quiet zone.
+    The matching threshold is a fraction of the disc's size in the image. On a board of patches, the disc is the patch
+    without rim and quiet zone.
 
     Examples
     --------
