@@ -29,8 +29,8 @@ class Evidence(IntEnum):
     """Columns of the evidence that a judge sees.
 
     The first judge sees the columns from ``NETWORK_SCORE`` to ``RADIUS``. The second judge, after the fit, sees all
-    columns. Logs are natural. Distances are in short semi-axes. Formulas leave out the small constants that keep the
-    logs finite. The contrast is white - black.
+    columns. Logs are natural. Distances are in short semi-axes. Most formulas leave out the small constants that keep
+    the logs finite. The contrast is white - black.
     """
 
     NETWORK_SCORE = 0

@@ -78,15 +78,15 @@ LARGEST_FIT_MOVE = 0.1
 """If a fit moves the centre further than this, in short semi-axes, the pose before the fit is kept. After such a move,
 the pose before the fit is right more often."""
 USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. In an image with n candidates, where n is larger,
+"""Number of candidates in a typical training image of 640x480 px. If an image has n > USUAL_PLACES candidates,
 log(n / USUAL_PLACES) is subtracted from the second judge's log odds."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
 """Lower limit of two contrasts, grey levels.
 
-- A hypothesis is dropped if (white - black) / 2 is at most this limit before the fit.
-- A contrast white - black below this limit, after the fit, is raised to the limit in the evidence.
+- Before the fit, a hypothesis is dropped if (white - black) / 2 is at most the limit.
+- In the evidence of the fit, a lower contrast white - black is raised to the limit.
 """
 PLACES_PER_BLOCK = 2**11
 """Largest number of places that the ellipse network sees in one call. This limits the memory use."""
@@ -140,7 +140,7 @@ def verify_candidates(
     network_score : ndarray of shape (n,)
         Scores of the candidates by the detector head, in [0, 1].
     log_id : ndarray of shape (n, len(patches) + 1)
-        Log probability of each design, and in the last column of no patch, by the ID head.
+        Log probabilities by the ID head: one column per design, and a last column for no patch.
     patches : sequence of Patch
         The designs.
     threads : int
@@ -328,8 +328,8 @@ def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patc
 def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Float) -> Float:
     """Compare each hypothesis with the hypotheses elsewhere in the image.
 
-    A hypothesis is elsewhere if the distance of the two centres is larger than the short semi-axis of the hypothesis
-    that is compared. Let p be the probability, by the first judge, that a hypothesis is right.
+    Hypothesis b is elsewhere, seen from hypothesis a, if the distance of the centres is larger than the short semi-axis
+    of a. Let p be the probability, by the first judge, that a hypothesis is right.
 
     Parameters
     ----------
