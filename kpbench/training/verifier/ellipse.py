@@ -235,7 +235,7 @@ def _concatenate(parts: Sequence[Places]) -> PlaceTensors:
 
 
 def _train(places: PlaceTensors, epochs: int, batch: int, from_shipped: bool) -> EllipseNetwork:
-    """Train with cross-entropy for the log odds and, at places on patches, with smooth L1 loss for shift and log map."""
+    """Train with cross-entropy for the log odds, and with smooth L1 loss for shift and log map of places on patches."""
     torch.manual_seed(0)
     network = EllipseNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     count = len(places.on_patch)

@@ -54,8 +54,8 @@ from kpbench.types import Float
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
 """Number of channels of the first layers: of the first judge, and of the second judge."""
 KNOWN_SHARE = 12.0
-"""Let z be the log odds that the shipped first judge gives to the true label of a hypothesis. In an epoch, the hypothesis
-is drawn with the probability min(KNOWN_SHARE · exp(-z/2), 1)."""
+"""In an epoch, a hypothesis is drawn with the probability min(KNOWN_SHARE · exp(-z/2), 1). z are the log odds that the
+shipped first judge gives to the true label of the hypothesis."""
 
 
 def train_judges(
@@ -193,8 +193,8 @@ def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], 
 def _train(training: LabelledHypotheses, name: str, width: int, settings: _Settings) -> Judge:
     """Train a judge with two losses.
 
-    The first loss is the cross-entropy of the log odds. The second loss is the smooth L1 loss of shift and log map; only
-    hypotheses where ``training.near`` is true contribute to the second loss.
+    The first loss is the cross-entropy of the log odds. The second loss is the smooth L1 loss of shift and log map, and
+    counts only hypotheses where ``training.near`` is true.
     """
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
