@@ -214,8 +214,8 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     """Measure the contrast of each patch in an image: grey level of white minus grey level of black.
 
     The method is linear regression over the pixels that lie wholly on the patch: the grey level of a pixel is regressed
-    on the fraction of the pixel that black ink covers. The contrast is the negative slope of the regression. Noise does not bias
-    the contrast. Blur and shadow lower the contrast.
+    on the fraction of the pixel that black ink covers. The contrast is the negative slope of the regression line. Noise
+    does not bias the contrast. Blur and shadow lower the contrast.
 
     Parameters
     ----------
