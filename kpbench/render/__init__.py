@@ -1,7 +1,7 @@
-"""Rendering of patches in front of a background: a clean image and its truth.
+"""Rendering of clean images of patches in front of a background, with the true keypoints.
 
-There are two kinds of scene: single patches in random poses (``render_scene``), and one board in front of a camera
-(``render_board``). Both functions paint by exact area coverage.
+``render_scene`` draws single patches in random poses. ``render_board`` draws one board in front of a camera. Both
+functions blend each pixel by the exact fraction of its area that the patch or the board covers.
 """
 
 import lazy_loader

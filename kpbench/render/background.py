@@ -22,11 +22,12 @@ from kpbench.types import Float, UInt8
 CACHE_BYTES = 128 * 2**20
 """Largest size of the cache of decoded photographs of a :class:`PhotoFolder`, bytes."""
 LEAVES = 700
-"""Number of shapes in a procedural background; together they cover the image about twice."""
+"""Number of shapes in a procedural background. In an image of 640x480 px, the areas of the shapes sum to about the area
+of the image."""
 LEAF_RADIUS = (0.008, 0.35)
 """Smallest and largest radius of a shape in a procedural background, as fractions of the image's longer side."""
 TEXTURE_OCTAVES = 7
-"""Number of layers of smooth noise in a procedural background; the resolution halves from layer to layer."""
+"""Number of noise layers in a procedural background. Each layer has half the resolution of the previous one."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,9 @@ class Background:
 
 @dataclass
 class PhotoFolder:
-    """Photographs in a folder and in its subfolders, of any size and colour mode; some photographs may be broken.
+    """Photographs in a folder and its subfolders. The photographs may have any size and colour mode, and may be broken.
 
-    Decoded photographs are kept in a cache of bounded size. The cache changes no result.
+    A cache of bounded size keeps decoded photographs. The cache affects the speed, but no result.
 
     Attributes
     ----------
@@ -101,7 +102,7 @@ class PhotoFolder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 over the names and sizes of all files; a changed digest shows that the folder has changed."""
+        """SHA-256 of the names and sizes of all files; a changed digest shows that the folder has changed."""
         listing = "\n".join(f"{name}\t{(self.path / name).stat().st_size}" for name in self.files)
         return hashlib.sha256(os.fsencode(listing)).hexdigest()
 
@@ -133,14 +134,15 @@ class PhotoFolder:
         return image
 
     def _files_from(self, first: int) -> Iterator[str]:
-        """Yield all files, first from position ``first`` to the end, then from the start."""
+        """Yield all files: from position ``first`` to the end, then from the start to position ``first``."""
         yield from self.files[first:]
         yield from self.files[:first]
 
     def sample(self, rng: np.random.Generator, width_px: int, height_px: int, channels: int) -> Background:
         """Draw a random crop of a random photograph, mirrored with probability 0.5 and resized.
 
-        The next file of the list replaces a broken file. Broken files therefore do not change the random numbers.
+        If a file is broken, the next file of ``files`` is used. A broken file therefore does not change the random
+        numbers.
 
         Parameters
         ----------
@@ -173,7 +175,7 @@ class PhotoFolder:
 
 
 def describe_backgrounds(photos: PhotoFolder | None) -> dict[str, Any]:
-    """Return the entry of a dataset's config that describes the backgrounds; the entry holds no path."""
+    """Return the entry that describes the backgrounds in a dataset's config. The entry holds no path."""
     if photos is None:
         return {"kind": "procedural"}
     return {"kind": "photographs", "files": len(photos.files), "listing_sha256": photos.digest}
@@ -199,9 +201,9 @@ def _crop_and_resize(
 def procedural_background(rng: np.random.Generator, width_px: int, height_px: int, channels: int = 1) -> UInt8:
     """Draw a background that needs no photographs: dead leaves under 1/f texture.
 
-    Opaque shapes of random size, position and grey hide each other. Their radii have the density r⁻³, which
-    gives the scale-invariant edges of natural images [1]_. Octaves of smooth noise add a surface texture with
-    a 1/f spectrum.
+    Opaque shapes of random size, position and grey hide each other. The probability density of the radius r is
+    proportional to r⁻³. The edges are therefore scale-invariant, as in natural images [1]_. Octaves of smooth noise add
+    a surface texture with a 1/f spectrum.
 
     Parameters
     ----------
@@ -228,7 +230,7 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
     """
     canvas = np.full((height_px, width_px, channels), round(rng.uniform(40, 215)), np.uint8)
     smallest, largest = LEAF_RADIUS
-    # the inverse of the cumulative distribution of the radius, which is truncated at the largest radius
+    # inverse transform sampling: the inverse of the cumulative distribution of the radius, from smallest to largest
     radius_px = smallest * max(width_px, height_px) / np.sqrt(1 - rng.random(LEAVES) * (1 - (smallest / largest) ** 2))
     centre_px = rng.uniform(0, 1, (LEAVES, 2)) * (width_px, height_px)
     ratio, angle_deg = rng.uniform(0.3, 1.0, LEAVES), rng.uniform(0, 360, LEAVES)
@@ -246,7 +248,7 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
 
 
 def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
-    """Return the sum of smooth noise over all octaves: shape (height_px, width_px), float32, grey levels."""
+    """Return the sum of all octaves of smooth noise: ndarray of shape (height_px, width_px), float32, grey levels."""
     strength = rng.uniform(2, 14)
     sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
     octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
@@ -258,7 +260,7 @@ def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> An
 
 
 def _circle_corners(count: int, start_deg: float = 0.0) -> Float:
-    """Return the corners of a regular polygon on the unit circle, ndarray of shape (count, 2)."""
+    """Return the corners of a regular polygon on the unit circle: ndarray of shape (count, 2)."""
     angles = np.radians(start_deg) + np.arange(count) * (2 * np.pi / count)
     return np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -266,14 +268,14 @@ def _circle_corners(count: int, start_deg: float = 0.0) -> Float:
 def _place_polygon(
     corners: Float, centre_px: Float, radius_px: Float, ratio: Float, angle_deg: Float
 ) -> NDArray[np.int32]:
-    """Stretch, turn and move one polygon to many places.
+    """Return n copies of one polygon: each copy stretched, turned and moved.
 
     Parameters
     ----------
     corners : ndarray of shape (k, 2)
     centre_px : ndarray of shape (n, 2)
     radius_px, ratio, angle_deg : ndarray of shape (n,)
-        Semi-axis along x before the turn, ratio of the semi-axis along y to the semi-axis along x, and the turn.
+        Semi-axis along x before the turn; (semi-axis along y) / (semi-axis along x); angle of the turn.
 
     Returns
     -------

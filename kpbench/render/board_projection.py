@@ -1,6 +1,6 @@
 """Poses of a board, and the exact projection of a board into the image, with lens distortion.
 
-The share of the image that the board covers determines the board's distance, because the experiments fix this share.
+The experiments fix the share of the image that the board covers. This share determines the board's distance.
 :mod:`kpbench.geometry` describes the frames.
 """
 
@@ -18,11 +18,11 @@ from kpbench.patches.board import BoardLike
 from kpbench.types import Float
 
 FREE_MARGIN = 0.01
-"""Width of the border of the image that stays free of the board, in image widths."""
+"""Least distance between the board and the border of the image, in image widths."""
 LONGEST_PIECE_PX = 8.0
-"""Longest straight piece of a projected outline if the lens bends lines, px."""
+"""If the lens bends lines, edges are cut into straight pieces of at most this length, px (see ``MOST_PIECES``)."""
 MOST_PIECES = 400
-"""Largest number of straight pieces of one edge of the board."""
+"""Largest number of straight pieces of one edge; pieces of a very long edge are longer than ``LONGEST_PIECE_PX``."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: floa
 
 
 def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
-    """Project a polygon on the board into the image; if the lens bends lines, the edges are cut into short pieces."""
+    """Project a polygon on the board into the image. If the lens bends lines, cut the edges into short pieces."""
     if not any(camera.distortion):
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm
@@ -94,14 +94,14 @@ def pose_board(
     roll_deg: float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
 ) -> Pose:
-    """Place a board at any tilt so that the board covers a given share of the image.
+    """Place a board at a given tilt, at the distance where the board covers a given share of the image.
 
     Parameters
     ----------
     camera : Camera
     board : Board or TagBoard
     area_percent : float
-        Projected area, percent of the image's pixels.
+        Projected area of the board, in percent of the image's area.
     pitch_deg : float
         Tilt about the camera's x axis. A positive pitch moves the board's upper side away from the camera, as if the
         board lay on a table.
@@ -112,7 +112,8 @@ def pose_board(
         Turn of the board in its own plane, before any tilt, from +x towards +y.
     shift : (float, float)
         Offset of the board's centre from the image's centre, in image widths and heights, before lens distortion. If
-        the board would leave the image, the shift is reduced to 0.8, 0.6, 0.4, 0.2 or 0 times its value.
+        the board would not fit into the image, the largest of 0.8, 0.6, 0.4, 0.2 and 0 times the shift is used at
+        which the board fits.
 
     Returns
     -------
@@ -133,8 +134,8 @@ def pose_board(
     >>> pose.t_camera.round().tolist()
     [0.0, 0.0, 283.0]
     """
-    # a positive x angle of rotation_xyz turns +y (down) away from the camera; a positive y angle turns +x towards the
-    # camera
+    # in rotation_xyz, a positive x angle turns +y (down) away from the camera, and a positive y angle turns +x towards
+    # the camera; pitch and yaw have the opposite signs
     R = rotation_xyz(0, -yaw_deg, 0) @ rotation_xyz(-pitch_deg, 0, 0) @ rotation_xyz(0, 0, roll_deg)
     size = np.array([camera.width_px, camera.height_px])
     margin_px = FREE_MARGIN * camera.width_px
@@ -149,7 +150,7 @@ def pose_board(
 
 
 def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px: float) -> float:
-    """Find the distance along the optical axis, mm, at which the board covers ``area_px`` square pixels."""
+    """Find the depth (distance along the optical axis), mm, at which the board covers ``area_px`` square pixels."""
 
     def solve(lens: Camera, nearest_mm: float, farthest_mm: float) -> float:
         def log_area_ratio(log_depth: float) -> float:
@@ -165,7 +166,8 @@ def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px:
         depth_mm = solve(replace(camera, distortion=NO_DISTORTION), nearest_mm, 4 * frontal_mm)
         if not any(camera.distortion):
             return depth_mm
-        # the lens polynomial is valid only in and near the image, so search near the depth without distortion
+        # the lens polynomial is valid only in and near the image; the search therefore stays near ``depth_mm``, which
+        # holds without distortion
         return solve(camera, max(nearest_mm, 0.7 * depth_mm), 1.5 * depth_mm)
     except ValueError:
         raise DataError(f"no distance gives a board an image of {area_px:.0f} px at this tilt and lens") from None

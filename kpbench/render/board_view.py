@@ -1,7 +1,7 @@
-"""Views of a board in front of a camera: light, exact rendering, and the truth.
+"""Views of a board in front of a camera: light, exact rendering, and the true keypoints.
 
-Ink and paper are projected as outlines and painted by exact area coverage. Even a board that covers 0.5 % of the image
-is therefore not aliased.
+The outlines of ink and paper are projected into the image. Each pixel is blended by the exact fraction of its area that
+ink or paper covers. Even a board that covers 0.5 % of the image is therefore not aliased.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from kpbench.render.scene import Mask, Rendering, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 EDGE_WIDTH = 0.008
-"""Width of the band along the board's cut edge, in lengths of the board's shorter side."""
+"""Width of the band along the board's cut edge, as a fraction of the board's shorter side."""
 SHADOW_SHIFT = 0.4
-"""Shift of the board's shadow if the light has a slope of 1, in board sides."""
+"""(Shift of the board's shadow, in board sides) / (slope of the light)."""
 SHADOW_BLUR = 0.05
 """Standard deviation of the shadow's soft edge, in board sides."""
 SHADOW_GRID = 64
-"""Resolution of the coarse grid on which the shadow is computed, grid pixels per board side."""
+"""Number of pixels per board side in the coarse grid on which the shadow is computed."""
 RIM_POINTS = 720
-"""Number of points on a disc's rim from which the moments of the disc's distorted image are computed."""
+"""Number of points on a disc's rim; the moments of the disc's distorted image are computed from these points."""
 
 
 @dataclass(frozen=True)
@@ -40,17 +40,17 @@ class Appearance:
     Attributes
     ----------
     black, white : float
-        Grey levels of the two inks under full light; the paper has the grey level ``white``.
+        Grey levels of black ink and of white ink and paper, under full light.
     edge : float
         Brightness of the cut edge, as a fraction of ``white``.
     light : float
         Brightness at the board's centre, 0 to 1.
     slope : (float, float)
-        Change of brightness over one board side, to the right and downwards in the image. The light is
-        clipped to [0, 1].
+        Change of brightness over one board side of the image: to the right, and downwards. The brightness is clipped
+        to [0, 1].
     shadow : float
-        Fraction of the light that the board takes from the scene behind the board. The shadow has a soft edge and
-        falls away from the lamp, against the slope.
+        Fraction of its light that the scene behind the board loses in the board's shadow. The shadow has a soft edge,
+        and falls to the darker side of the board.
 
     Examples
     --------
@@ -68,11 +68,11 @@ class Appearance:
 
 
 def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any]:
-    """Compute the truth of every keypoint of a board that lies wholly in the image.
+    """Compute the true keypoints of a board.
 
-    A distorting lens maps no disc to an exact ellipse. For such a lens, ``H_patch2image`` is the homography that
-    agrees with the lens at the keypoint to first order, and the semi-axes belong to the ellipse with the same second
-    moments as the disc's exact image.
+    Behind a distorting lens, the image of a disc is no exact ellipse. For such a lens, ``H_patch2image`` is the
+    homography that agrees with the lens at the keypoint to first order. The semi-axes are those of the ellipse that has
+    the same second moments as the exact image of the disc.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
     Returns
     -------
     ndarray of shape (n,), KEYPOINT_DTYPE
-        ``visible`` is 1 and ``contrast`` is nan.
+        ``visible`` is 1, as if the board lay wholly in the image. ``contrast`` is nan.
 
     Examples
     --------
@@ -110,14 +110,17 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
 
 
 def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
-    """Return the pixel coordinates, shape (RIM_POINTS, 2), of evenly spaced points of the patch's unit circle."""
+    """Return the pixel coordinates, shape (RIM_POINTS, 2), of evenly spaced points on the patch's unit circle."""
     angles = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.ones(RIM_POINTS)])
     return camera.project(rim @ M_patch2camera.T)
 
 
 def _ellipse_of_moments(points: Float) -> Ellipse:
-    """Find the ellipse that has the centroid and the central second moments of a polygon (Green's theorem)."""
+    """Return the ellipse with the same centroid and the same central second moments as a polygon.
+
+    Green's theorem gives the moments of the polygon from its vertices.
+    """
     middle = points.mean(axis=0)
     a, b = points - middle, np.roll(points, -1, axis=0) - middle
     cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
@@ -133,7 +136,7 @@ def _ellipse_of_moments(points: Float) -> Ellipse:
 
 
 def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike, appearance: Appearance) -> Rendering:
-    """Paint a board in front of a background with exact area coverage.
+    """Draw a board in front of a background, by exact area coverage.
 
     Parameters
     ----------
@@ -190,21 +193,21 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike
 def _cover(
     outline: Float, face: Float, inks: list[list[Float]], discs: list[list[Float]]
 ) -> tuple[Box, Float, Float, Float, tuple[Mask, ...]]:
-    """Rasterise a board.
+    """Compute which fraction of each pixel a board, its face and its black ink cover.
 
     Parameters
     ----------
     outline, face : ndarray of shape (n, 2)
-        Outline of the board with and without the band along its cut edge, px.
+        Outline of the whole board, and outline of its face: the board without the band along the cut edge. px.
     inks, discs : list of lists of ndarray of shape (n, 2)
-        Black areas and patches, px.
+        Polygons of each black area, and polygons of each patch, px.
 
     Returns
     -------
     box : Box
-        The part of the image that holds the whole board.
+        Rectangle of pixels that holds the whole board.
     board, face, black : ndarray of shape (height, width)
-        Covered fraction of each pixel of the box.
+        Fraction of each pixel of the box that the board, the face or black ink covers.
     masks : tuple of Mask
         One mask per patch.
     """
@@ -240,7 +243,7 @@ def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: flo
 def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Appearance) -> None:
     """Darken the scene behind the board, in place.
 
-    The shadow is smooth. A coarse grid therefore suffices: the shadow is computed on this grid and enlarged.
+    The shadow is smooth. The shadow is therefore computed on a coarse grid, and enlarged.
     """
     step = max(1, round(side_px / SHADOW_GRID))  # px per pixel of the coarse grid
     blur = SHADOW_BLUR * side_px / step

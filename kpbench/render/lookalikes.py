@@ -1,6 +1,6 @@
 """Look-alikes: shapes that a detector may mistake for a patch, such as discs, rings, chequers, text and half-patches.
 
-Look-alikes have no label: a detector must not report them. OpenCV draws them, without exact edges.
+Look-alikes have no keypoint: a detector must not report a look-alike. OpenCV draws look-alikes, without exact edges.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def draw_lookalikes(
     count : int
         Number of look-alikes.
     patches : sequence of Patch
-        The designs whose halves are drawn.
+        The designs of the half-patches.
     radius_px : (float, float)
         Smallest and largest radius; radii are drawn log-uniformly.
 
@@ -88,7 +88,7 @@ def draw_lookalikes(
 
 
 def _colour(image: UInt8, level: float) -> tuple[float, ...]:
-    """Return a grey level as OpenCV's colour for a grey or RGB image."""
+    """Return a grey level in the form in which OpenCV takes a colour for this image, which is grey or RGB."""
     return (level,) * (1 if image.ndim == 2 else 3)
 
 
@@ -98,7 +98,7 @@ def _to_sixteenths(points: Float) -> np.ndarray[tuple[int, ...], np.dtype[np.int
 
 
 def _fill_ellipse(image: UInt8, lookalike: Lookalike, scale: float, level: float, end_deg: float = 360) -> None:
-    """Fill the ellipse of a look-alike, scaled about its centre; an ``end_deg`` of 180 fills only one half."""
+    """Fill the ellipse of a look-alike, scaled about its centre. If ``end_deg`` is 180, fill only one half."""
     centre = (round(lookalike.x * 16), round(lookalike.y * 16))
     axes = (round(lookalike.radius * scale * 16), round(lookalike.radius * lookalike.ratio * scale * 16))
     cv2.ellipse(image, centre, axes, lookalike.angle_deg, 0, end_deg, _colour(image, level), -1, cv2.LINE_AA, 4)
@@ -114,7 +114,7 @@ def _draw_rings(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) ->
 
 
 def _draw_half_disc(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
-    """Draw a disc, one half dark and one half light."""
+    """Draw a disc with a dark half and a light half."""
     _fill_ellipse(image, lookalike, 1, lookalike.second_ink)
     _fill_ellipse(image, lookalike, 1, lookalike.ink, 180)
 
@@ -144,7 +144,7 @@ def _draw_bar(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> N
 
 
 def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
-    """Draw a chequer board. Each inner corner looks like the patch ``checker``, but has neighbours."""
+    """Draw a chequer board. Each inner corner looks like the patch ``checker``, but is next to other squares."""
     rows, columns = (int(v) for v in rng.integers(3, 8, 2))
     side = min(lookalike.radius, 18.0)
     A = _rotation(lookalike.angle_deg) @ np.diag([side, side * max(lookalike.ratio, 0.5)])
@@ -157,20 +157,20 @@ def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike)
 
 
 def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalike, patch: Patch) -> None:
-    """Draw a patch without the part on one side of a cut. The cut-off part holds the centre, which is the keypoint."""
+    """Draw the smaller part of a patch that was cut in two. The other part held the keypoint, and is not drawn."""
     black, disc = unit_polygons(patch, 2.0**-8)
     cut = float(rng.uniform(0.15, 0.4))  # distance from the centre to the cut, in radii
     spin = _rotation(float(rng.uniform(0, 360)))
     A = _rotation(lookalike.angle_deg) @ np.diag([1, lookalike.ratio]) * lookalike.radius
     light, dark = max(lookalike.ink, lookalike.second_ink), min(lookalike.ink, lookalike.second_ink)
     for polygons, level in ((disc, light), (black, dark)):
-        # vertices in the cut-off part move onto the cut, so that this part of a polygon loses its area
+        # vertices of the other part move onto the cut: this part of the polygon then has no area
         kept = [np.maximum(polygon @ spin.T, (cut, -np.inf)) @ A.T + (lookalike.x, lookalike.y) for polygon in polygons]
         cv2.fillPoly(image, [_to_sixteenths(points) for points in kept], _colour(image, level), cv2.LINE_8, 4)
 
 
 def _rotation(angle_deg: float) -> Float:
-    """Return the matrix of a rotation from +x towards +y, ndarray of shape (2, 2)."""
+    """Return the matrix (2, 2) of a rotation from +x towards +y."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     return np.array([[c, -s], [s, c]])
 

@@ -16,38 +16,38 @@ from kpbench.types import Float
 GAP_PX = 2.0
 """Smallest gap between the rims of two patches of a random scene, px."""
 PLACEMENT_ROUNDS = 25
-"""Largest number of rounds in the search for free places in a random scene; usually one round is enough."""
+"""Largest number of rounds in the search for free places in a random scene. Usually, one round suffices."""
 LARGEST_DEPTH_CHANGE = 0.5
-"""Largest change of depth from a disc's centre to its rim, relative to the depth of the centre."""
+"""Largest difference in depth between a disc's centre and its rim, as a fraction of the depth of the centre."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Ranges within which a random scene is drawn.
+    """Ranges from which a random scene is drawn.
 
-    The default is the paper's range (§3.2), if the paper gives a range.
+    The defaults are the ranges of the paper (§3.2), where the paper gives a range.
 
     Attributes
     ----------
     count : (int, int)
-        Fewest and most patches per image.
+        Smallest and largest number of patches per image.
     minor_axis_px : float
-        Smallest full length of the short axis of a projected disc, px.
+        Least minor axis of a projected disc, px. The minor axis is twice the minor semi-axis.
     axis_difference : float
-        Largest (major − minor) / major of a projected disc.
+        Largest (major axis − minor axis) / major axis of a projected disc.
     radius_px : (float, float)
         Smallest and largest radius of a disc before the tilt, px; the radius is drawn log-uniformly.
     tilt_deg : float
-        Largest tilt about each of the two axes in the patch's plane, degrees; the two tilts are drawn independently.
+        Largest tilt, degrees. A patch is tilted about two axes in its plane; the two angles are drawn independently.
     focal : (float, float)
         Shortest and longest focal length, in image widths; the focal length is drawn log-uniformly.
     black, white : (float, float)
-        Ranges of the two inks, grey levels.
+        Smallest and largest grey level of black ink, and of white ink.
 
     Raises
     ------
     DataError
-        If ``radius_px`` is no range of radii, or too small for ``minor_axis_px``.
+        If ``radius_px`` is no range from 1 to 4096 px, or if its largest radius is too small for ``minor_axis_px``.
 
     Examples
     --------
@@ -69,7 +69,7 @@ class Limits:
         least, most = self.radius_px
         if not 1 <= least <= most <= 4096:
             raise DataError(f"`radius_px` is {least:g}:{most:g}, expected px from 1 to 4096, the smaller first")
-        if 2 * most < 1.2 * self.minor_axis_px:  # with smaller radii, hardly any tilt keeps the short axis long enough
+        if 2 * most < 1.2 * self.minor_axis_px:  # with smaller radii, too few tilts keep the minor axis long enough
             expected = f"expected a largest radius of at least {0.6 * self.minor_axis_px:g}: short axes are at least"
             raise DataError(f"`radius_px` is {least:g}:{most:g}, {expected} {self.minor_axis_px:g} px")
 
@@ -80,13 +80,14 @@ class Limits:
         Parameters
         ----------
         least_px, most_px : float
-            Smallest and largest radius before the tilt, px. The short semi-axis is at least ``least_px`` or
-            5 px, whichever is less.
+            Smallest and largest radius before the tilt, px. The least short semi-axis of the limits is the smaller of
+            ``least_px`` and 5 px.
 
         Raises
         ------
         DataError
-            If the two values are no range of radii, or if ``most_px`` is less than 1.2 times the least short semi-axis.
+            If the two values are no range from 1 to 4096 px, or if ``most_px`` is less than 1.2 times the least short
+            semi-axis.
 
         Examples
         --------
@@ -128,9 +129,9 @@ class Placement:
 def random_placements(
     rng: np.random.Generator, width_px: int, height_px: int, patches: Sequence[Patch], limits: Limits
 ) -> list[Placement]:
-    """Draw patches that keep the limits, do not overlap, and have their centres inside the image.
+    """Draw placements of patches. The patches keep the limits, do not overlap, and have their keypoints in the image.
 
-    Each patch is seen by its own camera, with its own focal length.
+    Each patch has its own camera, with its own focal length.
 
     Parameters
     ----------
@@ -143,7 +144,7 @@ def random_placements(
     Returns
     -------
     list of Placement
-        One placement per patch. A full image gets fewer patches than the number that was drawn.
+        One placement per patch. If an image has too little room, it gets fewer patches than ``limits.count`` asks for.
 
     Examples
     --------
@@ -167,7 +168,7 @@ def random_placements(
         H_extent2image = poses * np.stack([extent, extent, np.ones(candidates)], axis=1)[:, None]
         centre, reach, _, _ = project_discs(H_extent2image)
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
-            # if the rim of a steeply tilted patch reaches the horizon, its image is no ellipse
+            # the image of a steeply tilted patch is no ellipse if its rim reaches the horizon
             has_ellipse = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
             is_free = all(math.hypot(x - x0, y - y0) > r + r0 + GAP_PX for x0, y0, r0 in circles)
             if len(placements) < count and has_ellipse and is_free:
@@ -177,7 +178,7 @@ def random_placements(
 
 
 def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px: int, limits: Limits) -> Float:
-    """Draw poses of single patches that keep the limits, with keypoints anywhere in the image.
+    """Draw poses of single patches. The poses keep the limits; the keypoints lie anywhere in the image.
 
     Parameters
     ----------
@@ -189,7 +190,7 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
     Returns
     -------
     ndarray of shape (count, 3, 3)
-        H_patch2image with H[:, 2, 2] = 1. The keypoints are therefore at (H[:, 0, 2], H[:, 1, 2]).
+        Homographies H_patch2image with H[:, 2, 2] = 1. The keypoints are therefore at (H[:, 0, 2], H[:, 1, 2]).
 
     Examples
     --------
@@ -220,9 +221,9 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
 def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, cx_px: float, cy_px: float) -> Float:
     """Compute the first two columns of ``K [r1 r2 t] / depth``, shape (n, 3, 3); the third column is not set.
 
-    The depth is ``focal_px / radius_px``, in disc radii. The rotation is made as in
-    :func:`kpbench.geometry.camera.rotation_xyz`: ``turn`` about z, then ``tilt[1]`` about y, then ``tilt[0]`` about x.
-    The angles are in rad. (cx_px, cy_px) is the principal point.
+    Lengths in space are measured in disc radii. The depth of the disc is therefore ``focal_px / radius_px``. r1 and r2
+    are columns of a rotation matrix as in :func:`kpbench.geometry.camera.rotation_xyz`: by ``turn`` about z, then by
+    ``tilt[1]`` about y, then by ``tilt[0]`` about x. The angles are in rad. (cx_px, cy_px) is the principal point.
     """
     (cx, cy), (sx, sy), cz, sz = np.cos(tilt), np.sin(tilt), np.cos(turn), np.sin(turn)
     H = np.empty((len(turn), 3, 3))

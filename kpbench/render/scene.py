@@ -17,17 +17,18 @@ from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
 WHOLLY_COVERED = 1 - 1e-6
-"""Least computed coverage of a pixel that lies wholly on a patch; the difference from 1 allows for rounding."""
+"""A pixel lies wholly on a patch if its computed coverage is above this threshold. Because of rounding, the computed
+coverage of such a pixel may differ from 1."""
 
 
 @dataclass(frozen=True)
 class Mask:
-    """Area coverage of one rendered patch.
+    """Fractions of pixels that one rendered patch covers.
 
     Attributes
     ----------
     box : Box
-        The rectangle of pixels that the two arrays cover; the rectangle may reach outside the image.
+        The rectangle of pixels to which the two arrays belong. The rectangle may reach outside the image.
     black : ndarray of shape (height, width)
         Fraction of each pixel that black ink covers.
     disc : ndarray of shape (height, width)
@@ -41,7 +42,7 @@ class Mask:
 
 @dataclass(frozen=True)
 class Rendering:
-    """A rendered image and its truth.
+    """A rendered image and its true keypoints.
 
     Attributes
     ----------
@@ -66,14 +67,16 @@ class Rendering:
 
 @lru_cache(maxsize=256)
 def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64], int, int]:
-    """Return the edges of a patch on the unit disc.
+    """Return the polygons of a patch on the unit disc, as edges.
+
+    ``tolerance`` : largest distance between an edge and the true outline, in disc radii.
 
     Returns
     -------
     vertices : ndarray of shape (3, N)
         Homogeneous coordinates; first the vertices of the black areas, then the vertices of the disc.
     next_vertex : ndarray of shape (N,)
-        Index of the vertex that follows on the same polygon.
+        Index of the next vertex of the same polygon. An edge leads from each vertex to its next vertex.
     black_count, disc_count : int
         Number of vertices of the black areas and of the disc.
     """
@@ -86,7 +89,7 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
 
 
 def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> list[Mask]:
-    """Compute the exact area coverage of patches; the patches may belong to different images.
+    """Compute which fraction of each pixel each patch covers. The patches may belong to different images.
 
     Parameters
     ----------
@@ -103,7 +106,7 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
         return []
     poses = np.stack([p.H_patch2image for p in placements])
     _, major, _, _ = project_discs(poses)
-    # rounded down to a power of two, so that patches of similar size share the cached polygons
+    # the tolerances are rounded down to powers of two, so that patches of similar size share cached polygons
     tolerances = 2.0 ** np.floor(np.log2(tolerance_px / major))
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     for p, tolerance in zip(placements, tolerances, strict=True):
@@ -120,7 +123,7 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
 
 
 def render_scene(background: UInt8, placements: Sequence[Placement]) -> Rendering:
-    """Draw patches onto a background with exact area coverage; the edges are accurate to 1/1000 px.
+    """Draw patches onto a background, by exact area coverage. The edges are accurate to 1/1000 px.
 
     Parameters
     ----------
@@ -131,7 +134,7 @@ def render_scene(background: UInt8, placements: Sequence[Placement]) -> Renderin
     Returns
     -------
     Rendering
-        ``keypoints["contrast"]`` is nan, see :func:`measure_contrast`.
+        ``keypoints["contrast"]`` is nan; :func:`measure_contrast` measures the contrast.
 
     Examples
     --------
@@ -208,11 +211,11 @@ def fraction_inside(image: UInt8, mask: Mask) -> float:
 
 
 def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
-    """Measure the contrast of each patch in an image: white minus black.
+    """Measure the contrast of each patch in an image: grey level of white minus grey level of black.
 
-    The grey level of the pixels that lie wholly on the patch is fitted by least squares as a line over the black
-    fraction. The contrast is the negative slope of this line. Noise does not bias the contrast; blur and shadow lower
-    it.
+    The method is linear regression over the pixels that lie wholly on the patch: the grey level of a pixel is regressed
+    on the fraction of the pixel that black ink covers. The contrast is the negative slope of the regression line. Noise
+    does not bias the contrast. Blur and shadow lower the contrast.
 
     Parameters
     ----------
@@ -222,7 +225,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     Returns
     -------
     ndarray of shape (n,), float64
-        Grey levels; nan if the image shows nothing of the patch or only one of its inks.
+        Contrasts, grey levels; nan if the image shows nothing of the patch, or only one of its inks.
 
     Examples
     --------
@@ -240,10 +243,10 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
         part = image[in_image]
         grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
         black = mask.black[in_box].ravel()
-        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # quicker than a selection of pixels
+        weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # faster than indexing with a mask
         count = weight.sum()
         weighted = weight * black
-        # sums, not @: a threaded BLAS costs more than it saves on so few pixels
+        # sums instead of @, because starting the threads of BLAS takes longer than summing so few pixels
         if count and (variation := (weighted * black).sum() - weighted.sum() ** 2 / count) > 1e-6 * count:
             contrast[n] = (weighted.sum() * (weight * grey).sum() / count - (weighted * grey).sum()) / variation
     return contrast

@@ -1,6 +1,6 @@
 """Training of the detector's network by a recipe, and of the three networks that verify the detector's candidates.
 
-Recipes and training samples need no further package. Everything else needs ``pip install 'kpbench[train]'``.
+Recipes and training samples need no further package. Training and export need ``pip install 'kpbench[train]'``.
 """
 
 import lazy_loader

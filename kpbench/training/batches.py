@@ -1,4 +1,4 @@
-"""Training samples, made on the fly. Seed and index determine the random numbers of a batch.
+"""Training samples, made on the fly. The seed of the training and the index of a batch determine the batch.
 
 There are two kinds of samples. Scenes are whole images, like the images of ``kpbench synth``. Crops
 (:mod:`kpbench.training.crops`) are small windows, degraded with a severity that the recipe sets.
@@ -27,11 +27,11 @@ from kpbench.types import Float32, UInt8
 from kpbench.workers import run_in_order
 
 VALIDATION_EVERY = 10
-"""One photograph in this many is kept for validation."""
+"""Every tenth photograph is kept for validation."""
 PHOTO_PX = 640
-"""Larger photographs are shrunk to this long side, px."""
+"""Longest side of a photograph, px; larger photographs are shrunk."""
 LEAST_PHOTO_PX = 8
-"""Smallest short side of a photograph after shrinking, px; narrower photographs are left out."""
+"""Least short side of a photograph after it was shrunk, px; narrower photographs are left out."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class SampleConfig:
     size : (int, int)
         Width and height of a sample, px; multiples of 8.
     set_size : int
-        Number of different scenes. Sample i shows scene i modulo ``set_size``. Crops never repeat.
+        Number of different scenes. Sample i shows scene number ``i % set_size``. Crops ignore ``set_size``: no crop is
+        repeated.
 
     Raises
     ------
@@ -77,9 +78,9 @@ class Batch(NamedTuple):
     ----------
     images : ndarray of shape (B, H, W), uint8
     keypoints : ndarray of shape (B, K, 4), float32
-        Columns: x and y, px; index of the design, -1 in rows without a keypoint; ignore radius, px. An ignore radius
-        of 0 marks a keypoint that the detector must find. A positive ignore radius marks a keypoint that is ignored:
-        the detector head is not trained within this radius.
+        Columns: x, px; y, px; index of the design; ignore radius, px. The index is -1 in rows without a keypoint. The
+        detector must find the keypoints with an ignore radius of 0. A keypoint with a positive ignore radius is
+        ignored: the detector head is not trained within this radius.
 
     Examples
     --------
@@ -96,13 +97,13 @@ class Batch(NamedTuple):
 def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     """Load the training photographs or the validation photographs of a folder, in grey, sorted by path.
 
-    Photographs are shrunk to a long side of at most 640 px. Broken photographs, and photographs with a short side under
-    8 px, are left out.
+    Photographs are shrunk to a long side of at most 640 px. Broken photographs are left out. Photographs whose short
+    side is then under 8 px are left out.
 
     Parameters
     ----------
     folder : path or None
-        None: 64 procedural textures stand in for the photographs.
+        Folder of photographs. None: 64 procedural textures replace the photographs.
     part : str
         "validation" (every tenth photograph) or "training" (the others). If the folder holds only one photograph, the
         photograph belongs to both parts.
@@ -110,7 +111,7 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     Raises
     ------
     DataError
-        If the folder holds no photographs, or no photograph of the part can be used.
+        If the folder holds no photographs, or if all photographs of the part are left out.
 
     Examples
     --------
@@ -167,7 +168,7 @@ def make_batch(
     count : int
         Number of samples.
     severity : float
-        From 0 to 1. For crops: severity of the degradations; at 0, only slight blur and noise remain. For scenes:
+        From 0 to 1. For crops: severity of the degradations; at 0, crops have only slight blur and noise. For scenes:
         probability that a scene is degraded.
 
     Examples
@@ -187,7 +188,7 @@ def make_batch(
 
 @dataclass(frozen=True)
 class BatchJob:
-    """A batch to be made: its index, its number of samples, and the severity of its degradations."""
+    """Order for one batch: index of the batch, number of samples, and severity (see :func:`make_batch`)."""
 
     index: int
     count: int
@@ -204,7 +205,7 @@ def training_batches(
 ) -> Iterator[Batch]:
     """Yield training batches in the order of their jobs; worker processes make the batches in advance.
 
-    The worker processes are spawned, not forked, so that they load neither torch nor its threads.
+    The worker processes are spawned, not forked. They therefore hold neither torch nor its threads.
 
     Parameters
     ----------
@@ -215,7 +216,7 @@ def training_batches(
     seed : int
     jobs : iterable of BatchJob
     workers : int
-        Number of worker processes. With 0, this process makes the batches.
+        Number of worker processes; 0: this process makes the batches.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""State of a training, and checkpoints.
+"""State of a training, and the checkpoints that store the state.
 
 A resumed training ends in the same weights, to the bit, as an uninterrupted training.
 """
@@ -23,7 +23,7 @@ from kpbench.training.recipe import Recipe, parse_recipe
 from kpbench.writing import write_file
 
 SCHEMA = "kpbench.checkpoint/1"
-"""Schema of the metadata in a checkpoint."""
+"""Name of the schema that a checkpoint's metadata follows."""
 
 
 @dataclass
@@ -34,9 +34,10 @@ class TrainingState:
     ----------
     recipe : Recipe
     network : SuperPoint
-        Network with the weights that are trained.
+        The network that is trained.
     mean : SuperPoint
-        Network with the running mean of the weights; this network is validated and exported.
+        A network whose weights are the running mean of the weights of ``network``. This network is validated and
+        exported.
     optimizer : torch.optim.Optimizer
     step : int
         Number of completed steps.
@@ -61,7 +62,7 @@ class TrainingState:
 
 
 def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
-    """Return the state of a training before its first step; the recipe's seed determines the weights.
+    """Return the state of a training before its first step; the recipe's seed determines the random weights.
 
     Examples
     --------
@@ -85,12 +86,12 @@ def start_state(recipe: Recipe, device: torch.device) -> TrainingState:
 
 
 def digest_designs(patches: Sequence[Patch]) -> str:
-    """Return one SHA-256 of all designs; the designs are in the order of the channels of the ID head."""
+    """Return one SHA-256 of a list of designs. The order of the list counts: design n is channel n of the ID head."""
     return hashlib.sha256("".join(p.digest for p in patches).encode()).hexdigest()
 
 
 def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:
-    """Write a state to one safetensors file. An interruption leaves no partial file."""
+    """Write a state, and its designs, to one safetensors file. An interruption leaves no partial file."""
     from safetensors.torch import save
 
     tensors = {f"network.{k}": v for k, v in state.network.state_dict().items()}
@@ -138,7 +139,7 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
     Raises
     ------
     DataError
-        If the file is no checkpoint, or was written with another recipe or other designs.
+        If the file is no checkpoint, or if its recipe or its designs differ from those of the training.
     """
     content, tensors = read_checkpoint(path)
     theirs = parse_recipe(content["recipe"], str(path))
@@ -157,7 +158,7 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
     for name, parameter in state.network.named_parameters():
         own = {key: moments[f"{key}.{name}"] for key in ("step", "exp_avg", "exp_avg_sq") if f"{key}.{name}" in moments}
         if own:
-            like = torch.empty_like(parameter)  # keeps the memory format, on which rounding may depend
+            like = torch.empty_like(parameter)  # has the memory format of the parameter; rounding may depend on it
             on_device = {key: value if key == "step" else like.clone().copy_(value) for key, value in own.items()}
             if parameter.device.type == "cuda":
                 on_device["step"] = on_device["step"].to(parameter.device)
@@ -166,7 +167,7 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
 
 
 def load_mean_network(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
-    """Return a network, in evaluation mode, with the running mean of a checkpoint's weights."""
+    """Return the network whose weights are the running mean in a checkpoint; the network is in evaluation mode."""
     network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
     network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
     return network.eval()

@@ -13,21 +13,22 @@ from kpbench.types import Float32, UInt8
 def degrade_crop(
     image: UInt8, rng: np.random.Generator, severity: float, radius: float
 ) -> tuple[UInt8, float, float, float]:
-    """Degrade a crop at random: change the light, add rain, blur and noise, and compress.
+    """Degrade a crop at random: change the light, add rain, blur and noise, and compress the crop as JPEG.
 
-    ``severity`` : from 0 to 1. ``radius`` : short semi-axis of the smallest patch, px; the radius limits the blur.
+    ``severity`` : from 0 to 1. ``radius`` : short semi-axis of the smallest patch, px; limits the width of the blur.
 
     Returns
     -------
     image : ndarray of shape (H, W), uint8
     gain : float
-        Estimated factor by which the contrast changes, where the contrast falls most.
+        Estimated contrast after the degradations / contrast before the degradations, at the point of the crop where
+        this ratio is smallest. A rise of contrast is not counted. Blur is not counted.
     kernel : float
         Width of the blur, px; 0: no blur.
     sigma : float
         Estimated standard deviation of the noise, grey levels.
     """
-    gain, kernel, sigma = 1.0, 0.0, 0.6  # 0.6 grey levels: noise of rounding and of a good sensor
+    gain, kernel, sigma = 1.0, 0.0, 0.6  # a good sensor and rounding give about 0.6 grey levels of noise
     work = image.astype(np.float32)
     if rng.random() < 0.3 * severity:
         work, factor = _draw_shadow(work, rng)
@@ -39,11 +40,11 @@ def degrade_crop(
     if rng.random() < 0.6 * severity + 0.2:
         work, kernel = _blur(work, rng, severity, radius)
     draw = rng.random()
-    if draw < 0.35 * severity:  # the severest rung of the effect dimming has the factor 0.6^4
+    if draw < 0.35 * severity:  # the strongest dimming of kpbench.degrade has the factor 0.6^4
         factor = 0.6 ** rng.uniform(0.0, 4.3)
         work *= np.float32(factor)
         gain *= factor
-        if rng.random() < 0.3:  # low light: photon noise; the sensor noise follows below
+        if rng.random() < 0.3:  # low light has photon noise; sensor noise is added below
             photons = rng.uniform(1.0, 8.0)
             level = np.maximum(work, 0.0) * np.float32(photons)
             work += rng.standard_normal(work.shape, dtype=np.float32) * np.sqrt(level) / np.float32(photons)
@@ -68,7 +69,7 @@ def degrade_crop(
 
 
 def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its contrast factor."""
+    """Draw a shadow with one straight border, a glare, or jagged shadows; return the image and its least gain."""
     height, width = work.shape
     kind = rng.random()
     if kind < 0.3:
@@ -89,7 +90,7 @@ def _draw_shadow(work: Float32, rng: np.random.Generator) -> tuple[Float32, floa
 
 
 def _draw_jagged_shadows(work: Float32, rng: np.random.Generator) -> tuple[Float32, float]:
-    """Draw one or two pentagonal shadows in and around the crop; the sides of a shadow may cross each other."""
+    """Draw one or two pentagonal shadows, whose sides may cross; return the image and its least gain."""
     height, width = work.shape
     light, darkest = np.ones_like(work), 1.0
     for _ in range(rng.integers(1, 3)):
@@ -115,7 +116,8 @@ def _draw_rain(work: Float32, rng: np.random.Generator) -> Float32:
 def _blur(work: Float32, rng: np.random.Generator, severity: float, radius: float) -> tuple[Float32, float]:
     """Blur with a box, a Gaussian, a line or a disc; return the image and the width of the blur, px.
 
-    The width is limited, so that a patch with the short semi-axis ``radius``, px, stays visible.
+    The limit of the width grows with ``radius`` and ``severity``. Patches with the short semi-axis ``radius`` stay
+    visible.
     """
     widest = 1.5 + severity * (min(1.4 * radius, 19.0) - 1.5)
     width = float(rng.uniform(1.0, max(widest, 1.5)))

@@ -1,4 +1,4 @@
-"""Training crops: small windows with patches, boards of patches and look-alikes. One call makes a batch.
+"""Training crops: small images with patches, boards of patches and look-alikes. One call makes a batch.
 
 One core makes several hundred crops per second. A keypoint that blur or noise hides is marked as ignored: the network
 learns neither to report nor to suppress this keypoint.
@@ -22,23 +22,23 @@ from kpbench.training.crop_effects import degrade_crop
 from kpbench.types import Float, Float32, UInt8
 
 MOST_KEYPOINTS = 12
-"""Rows of keypoints per sample; further keypoints of a sample are left out."""
+"""Number of rows of keypoints per sample. If a sample has more keypoints, the surplus keypoints are left out."""
 IMAGE_PX = (640, 480)
-"""Width and height of the whole image, px. A crop is a part of this image; focal lengths are drawn relative to the
-width of this image."""
+"""Width and height, px, of the image that a crop is imagined to be cut from. Focal lengths are drawn relative to this
+width."""
 ZOOM = (0.35, 3.0)
-"""Range of the scale of a background, px of the photograph per px of the crop."""
+"""Range of the scale of a background, in px of the photograph per px of the crop before it is resized."""
 VIEW_SCALES = {1.0: 0.2, 1.5: 0.55, 0.5: 0.25}
-"""Factor by which a crop is resized after drawing → share of the crops with this factor."""
+"""Factor by which a crop is resized after it was drawn → probability of this factor."""
 ENLARGED_RADIUS_PX = (4.0, 40.0)
-"""Range of the radii of patches in enlarged crops, px before the enlargement. Other crops use the default range of
-:class:`kpbench.render.Limits`."""
+"""Smallest and largest radius of a patch in crops that are enlarged, px before the enlargement. Other crops use the
+default radii of :class:`kpbench.render.Limits`."""
 LEAST_SIGNAL = 12.0
-"""Least contrast · √area / noise; keypoints with a lower value are ignored. At this value, the output of a matched
-filter is 6 standard deviations of the noise."""
+"""Least value of contrast · √area / noise; keypoints with a lower value are ignored. The signal-to-noise
+ratio of a matched filter is then 6, because the inks differ from their mean by half the contrast."""
 LEAST_KEYPOINT_CONTRAST = 4.0
-"""Least contrast, grey levels; keypoints with a lower contrast are ignored. Rounding to 8 bits destroys most of a
-weaker pattern."""
+"""Least contrast, grey levels; keypoints with a lower contrast are ignored. At lower contrasts, rounding to 8 bits
+destroys most of the pattern."""
 
 
 def empty_keypoints(count: int) -> Float32:
@@ -68,7 +68,7 @@ def make_crops(
     count: int,
     severity: float,
 ) -> tuple[UInt8, Float32]:
-    """Return crops (count, height, width) and their keypoints, see :class:`kpbench.training.Batch`."""
+    """Return crops (count, height, width) and their keypoints; see :class:`kpbench.training.Batch`."""
     images = np.zeros((count, height, width), np.uint8)
     keypoints = empty_keypoints(count)
     discs: list[list[Disc]] = []
@@ -106,8 +106,8 @@ def cut_window(
 ) -> UInt8:
     """Cut a random window out of a photograph, resize the window, and mirror it with probability 0.5.
 
-    ``zoom`` : range of the scale, px of the photograph per px of the result. None: from half of the largest possible
-    scale to the largest possible scale.
+    ``zoom`` : range of the scale, in px of the photograph per px of the result. None: the range from 0.5 to 1 times the
+    largest scale at which the window fits into the photograph.
     """
     rows, columns = photo.shape
     largest = min(columns / width, rows / height)
@@ -121,7 +121,7 @@ def cut_window(
 
 
 def _draw_background(photos: Sequence[UInt8], rng: np.random.Generator, width: int, height: int) -> UInt8:
-    """Draw a background: mostly a window of a photograph, half of these with changed contrast; rarely an even grey."""
+    """Draw a background: a window of a photograph, half of the time with changed contrast, or rarely an even grey."""
     if rng.random() < 0.08:
         return np.full((height, width), rng.integers(256), np.uint8)
     image = cut_window(photos[int(rng.integers(len(photos)))], rng, width, height, ZOOM)
@@ -145,14 +145,14 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         if on_board:
             _draw_paper(image, rng, _poses_at(rng, rng.uniform(0, 1, (1, 2)) * (width, height), limits)[0])
         return []
-    # centres may lie a little outside the crop; a patch with its centre outside the crop gives no keypoint
+    # a centre may lie a little outside the crop; such a patch is visible in part and gives no keypoint
     at = rng.uniform(-0.1, 1.1, (1 if on_board else count, 2)) * (width, height) - 0.5
     poses = _poses_at(rng, at, limits)
     if on_board:
         first = poses[0]
         _draw_paper(image, rng, first)
-        # the patches of a hexagon board of side S have the radius 0.08 S and lie on a circle of radius 0.36 S, which
-        # is 4.5 patch radii; on other boards, the patches lie closer together or further apart
+        # on a hexagon board of side S, patches of radius 0.08 S lie on a circle of radius 0.36 S, which is 4.5 patch
+        # radii; the random factor stands for boards with closer patches and with patches further apart
         ring, turn = 4.5 * np.exp(rng.uniform(-0.6, 0.3)), rng.uniform(0, 2 * np.pi)
         corners = turn + np.arange(6) * np.pi / 3
         offsets = ring * np.column_stack([np.cos(corners), np.sin(corners)]) - ring * np.array(
@@ -194,14 +194,14 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
 
 
 def _poses_at(rng: np.random.Generator, at_px: Float, limits: Limits) -> Float:
-    """Draw poses in a whole image, and move their keypoints to the points ``at_px`` (N, 2) of the crop."""
+    """Draw poses in an image of ``IMAGE_PX``, and move their keypoints to the points ``at_px`` (N, 2) of the crop."""
     poses = random_poses(rng, len(at_px), *IMAGE_PX, limits)
     poses[:, :2] += (at_px - poses[:, :2, 2])[:, :, None] * poses[:, 2:]
     return poses
 
 
 def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
-    """Draw a sheet of paper in the plane of the patches. The sheet is mostly light, and sometimes of any grey level."""
+    """Draw a sheet of paper in the plane of the patches: light in three of four cases, otherwise of any grey level."""
     grey = rng.uniform(170, 255) if rng.random() < 0.75 else rng.uniform(0, 255)
     low, high = -rng.uniform(1.3, 12.0, 2), rng.uniform(1.3, 12.0, 2)
     corners = np.array([[low[0], low[1], 1], [high[0], low[1], 1], [high[0], high[1], 1], [low[0], high[1], 1]]) @ H.T
@@ -211,7 +211,7 @@ def _draw_paper(image: UInt8, rng: np.random.Generator, H: Float) -> None:
 
 
 def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patches: Sequence[Patch]) -> list[Disc]:
-    """Draw look-alikes at random places, and return the patches of which more than a third is hidden."""
+    """Draw look-alikes at random places. Return the patches that the look-alikes hide by more than a third."""
     before = image.copy()
     draw_lookalikes(image, rng, int(rng.integers(1, 4)), patches)
     changed = (image != before).astype(np.float32)
@@ -227,7 +227,7 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patc
 def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
     """Draw the patches of a whole batch with one call of the rasteriser."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
-    # an edge error of 1/64 px is far below the noise; edges as fine as in benchmark images would take longer
+    # an edge error of 1/64 px is far below the noise; the exact edges of benchmark images would take longer
     masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
         paint_patch(image, mask, placement.black, placement.white)

@@ -1,6 +1,6 @@
 """Export of a trained network as one ONNX file.
 
-The file takes any number of images whose sides are multiples of 8 px.
+The network in the file takes any number of images of one size. The sides must be multiples of 8 px.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from kpbench.writing import require_writable, write_file
 OPSET = 17
 """Version of the ONNX operator set."""
 MOST_DIFFERENCE = 1e-4
-"""Largest allowed difference between a logit of PyTorch and the same logit of ONNX Runtime."""
+"""Largest allowed difference between a logit computed by PyTorch and the same logit computed by ONNX Runtime."""
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Exported:
     bytes : int
         Size of the file.
     step : int
-        Number of training steps of the network.
+        Number of steps for which the network was trained.
     difference : float
-        Largest difference between the logits of the file and the logits of the network that was converted.
+        Largest difference between a logit of the file and the same logit of the network before its conversion.
 
     Examples
     --------
@@ -56,7 +56,7 @@ class Exported:
 
 
 def fold_batchnorm(network: SuperPoint) -> SuperPoint:
-    """Fold each BatchNorm into the convolution before it, in place; a BatchNorm after a ReLU stays."""
+    """Fold each BatchNorm into the convolution before it, in place. A BatchNorm that follows a ReLU is kept."""
     network.eval()
     for module in network.modules():
         parts = dict(module.named_children())
@@ -68,12 +68,12 @@ def fold_batchnorm(network: SuperPoint) -> SuperPoint:
 
 
 def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
-    """Return the network as ONNX: input ``image`` (B, 1, H, W) in [0, 1], outputs ``detector`` and ``identity``."""
+    """Return an ONNX file as bytes: input ``image`` (B, 1, H, W) in [0, 1], outputs ``detector`` and ``identity``."""
     import onnx
 
     buffer = io.BytesIO()
     with warnings.catch_warnings():
-        # the deprecated exporter is used, because its successor needs more packages
+        # the exporter is deprecated, but its successor needs more packages
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             network,
@@ -96,14 +96,16 @@ def to_onnx(network: SuperPoint, metadata: dict[str, Any]) -> bytes:
 
 
 def require_onnx_target(out: str | Path) -> None:
-    """Raise an error if no ONNX file can be written to a path; call this function before the work starts."""
+    """Raise an error if no ONNX file can be written to a path. Callers check the path before they start work."""
     if Path(out).suffix != ".onnx":
         raise DataError(f"{out}: expected a name ending in .onnx")
     require_writable(Path(out), "superpoint")
 
 
 def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
-    """Write the running mean of a checkpoint as an ONNX file, if ONNX Runtime and PyTorch give the same logits to 1e-4.
+    """Write the running mean of a checkpoint's weights as an ONNX file.
+
+    The file is written only if ONNX Runtime and PyTorch give the same logits, to 1e-4.
 
     Parameters
     ----------
@@ -151,6 +153,6 @@ def export_onnx(checkpoint: str | Path, out: str | Path) -> Exported:
 
 
 def largest_difference(data: bytes, image: Any, expected: list[Any]) -> float:
-    """Return the largest difference between the outputs of an ONNX model for an input and the expected outputs."""
+    """Return the largest difference between an output of an ONNX model, for the input ``image``, and ``expected``."""
     got = open_session(data)[0].run(None, {"image": image})
     return max(float(np.abs(a - b).max()) for a, b in zip(got, expected, strict=True))

@@ -1,8 +1,9 @@
-"""The training loop, over samples that are made on the fly.
+"""The training loop. Worker processes make the samples while the network is trained.
 
-A recipe is a TOML file (:mod:`kpbench.training.recipe`). Progress is counted in samples, so a recipe means the same on
-one processor and on eight accelerators. A batch is a function of recipe and step. A training resumed from a checkpoint
-(:mod:`kpbench.training.checkpoint`) therefore ends in the same weights, to the bit, as an uninterrupted training.
+A recipe is a TOML file (:mod:`kpbench.training.recipe`). A recipe counts progress in samples, and therefore means the
+same on one processor and on eight accelerators. Recipe and step determine a batch. A training that is resumed from a
+checkpoint (:mod:`kpbench.training.checkpoint`) therefore ends in the same weights, to the bit, as an uninterrupted
+training.
 
 Under ``torchrun`` with n processes, each process takes 1/n of the samples of each step, and gradients are averaged.
 """
@@ -33,7 +34,7 @@ from kpbench.training.validation import ValidationSets, make_validation_sets, va
 from kpbench.training.weights import load_initial_weights
 
 SAVE_EVERY_S, REPORT_EVERY_S = 300.0, 20.0
-"""Time between checkpoints, and between lines of losses in the log, s."""
+"""Time between checkpoints, s, and time between log lines with losses, s."""
 
 
 @dataclass(frozen=True)
@@ -48,9 +49,10 @@ class TrainOptions:
     resume : bool
         Resume from the checkpoint in the output folder.
     minutes : float, optional
-        Minutes after which the training stops; the training can be resumed later.
+        Minutes after which this run stops. The training can be resumed later. None: the run lasts until the recipe is
+        finished.
     workers : int
-        Number of processes that make samples; 0: the training process makes the samples.
+        Number of worker processes that make samples; 0: the training process makes the samples.
     threads : int, optional
         Number of threads of PyTorch; None: PyTorch chooses.
     validate_every : float
@@ -89,7 +91,7 @@ def train(
 ) -> bool:
     """Train the detector's network, or resume a training.
 
-    The checkpoint is ``checkpoint.safetensors``, the log is ``log.jsonl``.
+    The folder ``out`` receives the checkpoint ``checkpoint.safetensors`` and the log ``log.jsonl``.
 
     Parameters
     ----------
@@ -107,12 +109,12 @@ def train(
     Returns
     -------
     bool
-        Whether the recipe is finished.
+        True if the recipe is finished, False if the time limit stopped the training.
 
     Raises
     ------
     DataError
-        If recipe, designs, checkpoint, folder or initial weights do not fit together, or cannot be read.
+        If recipe, designs, checkpoint, folder and initial weights do not fit together, or if a file cannot be read.
     KeyboardInterrupt
         If a signal ended the training. The checkpoint is written before this exception is raised.
 
@@ -129,7 +131,7 @@ def train(
     leads = training.group.rank == 0
     signals = list[int]()
     with lock_folder(make_folder(training.folder)) if leads else nullcontext(), handle_end_signals(signals.append):
-        training.check()  # again: a run may have ended since
+        training.check()  # again, because another run may have written a checkpoint before the lock was taken
         state = training.begin(say)
         training.run(state, signals)
     if signals:
@@ -168,7 +170,7 @@ class _Training:
             raise DataError(f"{self.checkpoint}: nothing to go on from yet; leave `resume` out")
 
     def begin(self, say: Callable[[str], None]) -> TrainingState:
-        """Return the state before the next step: fresh, from initial weights, or from the checkpoint."""
+        """Return the state from which the run starts: random weights, initial weights, or the checkpoint."""
         if self.options.threads:
             torch.set_num_threads(self.options.threads)
         state = start_state(self.recipe, self.group.device)
@@ -180,9 +182,9 @@ class _Training:
         return state
 
     def run(self, state: TrainingState, signals: Sequence[int]) -> None:
-        """Train until the recipe is finished, the time limit is reached or a signal comes.
+        """Train until the recipe is finished, the time limit is reached, or a signal comes.
 
-        Checkpoints, validations and lines of the log are made regularly.
+        Checkpoints, validations and log lines are written at regular intervals.
         """
         group, options, leads = self.group, self.options, self.group.rank == 0
         validation = self.make_validation() if leads else []
@@ -225,7 +227,7 @@ class _Training:
         return make_validation_sets(self.recipe, self.designs, photos, self.options.validation_images)
 
     def batches(self, state: TrainingState) -> Iterator[Batch]:
-        """Return the batches of this process, beginning at the step of a state."""
+        """Return the batches that this process trains on, from the step of ``state`` to the end of the recipe."""
         recipe, group = self.recipe, self.group
         jobs = (
             BatchJob(step * group.size + group.rank, recipe.batch // group.size, recipe.phase(step)[1])

@@ -19,14 +19,15 @@ class Targets:
     Attributes
     ----------
     place : Tensor of shape (B, 65, h, w)
-        Probability of each pixel of the cell, and of "no keypoint"; the 65 probabilities have the sum 1.
+        Probability of each of the 64 pixels of a cell, and of "no keypoint"; the 65 probabilities sum to 1.
     valid : Tensor of shape (B, h, w)
-        1 where the detector head is trained, 0 near ignored keypoints.
+        1 in cells where the detector head is trained. 0 near ignored keypoints, except in cells that hold a keypoint
+        that must be found.
     identity : Tensor of shape (B, h, w), int64
-        Index of the design, or ``ids`` for "no patch".
+        Index of the design; ``ids`` means "no patch".
     near, far : Tensor of shape (B, h, w), bool
         ``near``: whether the centre of the cell lies within 8 px of a keypoint that must be found. ``far``: whether the
-        centre lies further than 16 px from all these keypoints and is not near an ignored keypoint.
+        centre lies more than 16 px from every keypoint that must be found, and is not near an ignored keypoint.
     """
 
     place: Tensor
@@ -81,12 +82,14 @@ def make_targets(keypoints: Tensor, height: int, width: int, ids: int, place: st
 
 
 def compute_losses(detector: Tensor, identity: Tensor, targets: Targets, config: LossConfig) -> tuple[Tensor, Tensor]:
-    """Return the losses of the detector head and of the ID head, from their logits.
+    """Return the loss of the detector head and the loss of the ID head.
 
     Parameters
     ----------
     detector : Tensor of shape (B, 65, h, w)
+        Logits of the detector head.
     identity : Tensor of shape (B, ids + 1, h, w)
+        Logits of the ID head.
     targets : Targets
     config : LossConfig
     """
@@ -103,18 +106,19 @@ def compute_losses(detector: Tensor, identity: Tensor, targets: Targets, config:
 
 
 def _cross_entropy(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
-    """Return the mean cross-entropy near keypoints plus the mean cross-entropy far from all keypoints."""
+    """Return the mean cross-entropy of the ``near`` cells plus the mean cross-entropy of the ``far`` cells."""
     entropy = F.cross_entropy(identity, targets.identity, reduction="none")
     near, far = targets.near, targets.far
     return (entropy * near).sum() / near.sum().clamp(min=1) + (entropy * far).sum() / far.sum().clamp(min=1)
 
 
 def _hinge(identity: Tensor, targets: Targets, config: LossConfig) -> Tensor:
-    """Return SuperPoint's descriptor loss (eq. 4 to 6 of the SuperPoint paper) between cells and one-hot vectors.
+    """Return SuperPoint's descriptor loss (eq. 4 to 6 of the SuperPoint paper).
 
-    The sum over pairs of cells is grouped by the class of the second cell. This is possible because the dot product of
-    a normalised descriptor and a one-hot vector is one channel of the descriptor. The class of a cell is the design of
-    its keypoint, or "no patch".
+    The loss is a sum over pairs of cells. The first cell gives a normalised descriptor, the second cell gives the
+    one-hot vector of its class. The class of a cell is the design of its keypoint, or "no patch". The dot product of a
+    descriptor and a one-hot vector is one channel of the descriptor. The sum is therefore computed class by class, and
+    not pair by pair.
     """
     has_keypoint = targets.place[:, -1] < 1
     classes = torch.where(has_keypoint, targets.identity, identity.shape[1] - 1)

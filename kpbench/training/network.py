@@ -1,12 +1,15 @@
-"""The network: SuperPoint with an attached layer on each head (paper §2.2); the recipe sets the sizes.
+"""The network: SuperPoint with one more layer, the attached layer, on each head (paper §2.2).
+
+The recipe sets the sizes of the layers.
 
 A VGG encoder reduces the image to cells of 8x8 px. The detector head gives 65 logits per cell: one per pixel of the
 cell, row by row, and one for "no keypoint". The descriptor head ends in an attached layer with one logit per design
-and one for "no patch". ``forward`` returns logits; :func:`kpbench.detectors.decode` turns them into keypoints outside
-of the exported graph.
+and one for "no patch"; this head is also called the ID head. ``forward`` and the exported graph return logits.
+:func:`kpbench.detectors.decode` turns the logits into keypoints.
 
-The parts have the names of the MIT-licensed re-implementation (rpautrat/SuperPoint, ``superpoint_pytorch.py``), so that
-its published weights can be loaded: ``backbone.<stage>.<n>.conv|bn``, ``detector.<n>``, ``descriptor.<n>``.
+The modules have the same names as in the MIT-licensed re-implementation (rpautrat/SuperPoint,
+``superpoint_pytorch.py``), so that the published weights of the re-implementation can be loaded. The names are
+``backbone.<stage>.<n>.conv|bn``, ``detector.<n>`` and ``descriptor.<n>``.
 """
 
 from __future__ import annotations
@@ -22,13 +25,16 @@ from kpbench.detectors.superpoint import CELL_PX
 from kpbench.training.recipe import NetworkConfig
 
 HALVINGS = 3
-"""Number of stages of the encoder that halve the image; a cell is ``2**HALVINGS`` px wide."""
+"""Number of encoder stages that halve the image; a cell is ``2**HALVINGS`` px wide."""
 NO_KEYPOINT_PRIOR = 0.98
-"""Probability of "no keypoint" and of "no patch" that an untrained network gives."""
+"""Probability that an untrained network gives to "no keypoint" and to "no patch"."""
 
 
 def conv_block(c_in: int, c_out: int, kernel: int, norm: str, stride: int = 1, relu: bool = True) -> nn.Sequential:
-    """Return a convolution with BatchNorm "before" or "after" the ReLU; ``relu=False`` leaves the ReLU out."""
+    """Return a convolution, a BatchNorm and a ReLU.
+
+    ``norm`` : position of BatchNorm, "before" or "after" the ReLU. ``relu`` : False leaves the ReLU out.
+    """
     conv = nn.Conv2d(c_in, c_out, kernel, stride, padding=kernel // 2)
     bn, activation = nn.BatchNorm2d(c_out, eps=1e-3), nn.ReLU(inplace=True) if relu else nn.Identity()
     parts = [("bn", bn), ("activation", activation)] if norm == "before" else [("activation", activation), ("bn", bn)]
@@ -81,7 +87,7 @@ class SuperPoint(nn.Module):
         return nn.Sequential(conv_block(c_in, width, 3, norm), conv_block(width, c_out, 1, norm, relu=False))
 
     def _initialise(self) -> None:
-        """Set Kaiming weights, and biases that give the prior. Without the prior, random weights do not learn."""
+        """Set random weights (Kaiming), and biases that give ``NO_KEYPOINT_PRIOR``. Without it, training fails."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
@@ -121,5 +127,5 @@ class SuperPoint(nn.Module):
 
 
 def network_input(images: Tensor) -> Tensor:
-    """Return images (B, H, W) uint8 as the network takes them: (B, 1, H, W) in [0, 1]."""
+    """Convert images (B, H, W), uint8, to the input of the network: (B, 1, H, W), float32, in [0, 1]."""
     return (images.float() / 255)[:, None].contiguous(memory_format=torch.channels_last)

@@ -17,7 +17,7 @@ class ProcessGroup:
     Attributes
     ----------
     rank : int
-        Number of the process, from 0.
+        Index of the process, from 0.
     size : int
         Number of processes.
     device : torch.device
@@ -37,7 +37,7 @@ class ProcessGroup:
         return bool(total.item())
 
     def average_gradients(self, network: nn.Module) -> None:
-        """Replace each gradient by its mean over all processes; send all gradients in one message."""
+        """Replace each gradient by its mean over all processes. One message holds all gradients."""
         if self.size == 1:
             return
         gradients = [p.grad for p in network.parameters() if p.grad is not None]
@@ -49,7 +49,7 @@ class ProcessGroup:
 
 
 def join_process_group() -> ProcessGroup:
-    """Return this process as a member of its group. ``torchrun`` describes the group in environment variables."""
+    """Join the group that the environment variables of ``torchrun`` describe. Return this process as a member."""
     rank, size = int(os.environ.get("RANK", 0)), int(os.environ.get("WORLD_SIZE", 1))
     cuda = torch.cuda.is_available()
     device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", 0))) if cuda else torch.device("cpu")

@@ -24,10 +24,10 @@ from kpbench.writing import write_file
 
 
 def export_int8(model: str | Path, out: str | Path) -> Exported:
-    """Convert an exported network to 8-bit integers: a quarter of the size, and three times as fast on a processor.
+    """Convert an exported network to 8-bit integers. The file shrinks to a quarter; a CPU runs it three times as fast.
 
-    The ranges of the activations are measured on 40 synthetic scenes over procedural backgrounds, at the detector's
-    image scales. About half of the scenes are degraded.
+    The ranges of the activations are measured on 40 synthetic scenes with procedural backgrounds. About half of the
+    scenes are degraded. Each scene is resized to one of the detector's image scales.
 
     Parameters
     ----------
@@ -37,7 +37,8 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     Returns
     -------
     Exported
-        ``difference`` is the largest difference from the logits of the float32 network, on an image of noise.
+        ``difference`` is measured on an image of noise: the largest difference between a logit of the new file and the
+        same logit of the float32 network.
 
     Raises
     ------
@@ -79,9 +80,9 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
 
 
 def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any:
-    """Return an ONNX model with its convolutions in 8-bit integers.
+    """Return an ONNX model whose convolutions compute with 8-bit integers.
 
-    Weights have 7 bits. With 8 bits, sums of products would saturate on processors without VNNI.
+    The weights have only 7 bits. With 8 bits, sums of products would saturate on processors without VNNI.
 
     Parameters
     ----------
@@ -101,7 +102,7 @@ def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "int8.onnx"
-        logging.disable(logging.WARNING)  # hides advice to preprocess the model, which convolutions do not need
+        logging.disable(logging.WARNING)  # hides the advice to preprocess the model; convolutions do not need this
         try:
             quantize_static(
                 model,

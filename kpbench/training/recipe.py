@@ -1,4 +1,4 @@
-"""Training recipes: TOML files, read into a frozen :class:`Recipe`. This module does not need torch."""
+"""Training recipes: TOML files that are read into a :class:`Recipe`. This module does not need torch."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from kpbench.training.batches import SampleConfig
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """Sizes of the network; the defaults are SuperPoint's.
+    """Sizes of the network. The defaults are the sizes of SuperPoint.
 
     Attributes
     ----------
     widths : tuple of 4 int
-        Channels of the encoder's stages, at strides 1, 2, 4 and 8.
+        Number of channels of each encoder stage. The stages work at strides 1, 2, 4 and 8.
     depths : tuple of 4 int
         Number of 3x3 convolutions in each stage.
     down : str
         How each of the first three stages halves the image: "max" (max-pooling after the stage) or "stride" (the
         last convolution of the stage has stride 2).
     head_width, descriptor_width : int
-        Channels of the hidden layer of each head, and channels of the descriptor.
+        Number of channels of the hidden layer of each head, and number of channels of the descriptor.
     norm : str
         Position of BatchNorm: "before" the activation (the export folds BatchNorm into the convolution) or "after"
         the activation (as in the published SuperPoint weights).
@@ -68,21 +68,22 @@ class LossConfig:
     Attributes
     ----------
     place : str
-        Target of the detector head: "pixel" (the pixel nearest to the keypoint, as in SuperPoint) or "split" (the four
-        pixels around the keypoint, with bilinear weights, also across cell borders).
+        Target of the detector head. "pixel": the pixel nearest to the keypoint, as in SuperPoint. "split": the four
+        pixels around the keypoint, with bilinear weights; the four pixels may belong to different cells.
     positive_weight : float
         Weight of a cell with a keypoint, relative to a cell without a keypoint.
     focal : float
-        Exponent of the focal factor, which lowers the weight of well-predicted cells in the detector loss (Lin et al.,
-        *Focal loss for dense object detection*, ICCV 2017); 0: no focal factor.
+        Exponent of the focal factor (Lin et al., *Focal loss for dense object detection*, ICCV 2017). The focal factor
+        lowers the weight of well-predicted cells in the detector loss. 0: no focal factor.
     identity : str
         "entropy": cross-entropy over designs and "no patch", at cells within 8 px of a keypoint and at cells more than
-        16 px from all keypoints. "hinge": SuperPoint's descriptor loss between all cells and their one-hot map. Two
-        cells of the same class are never a negative pair.
+        16 px from all keypoints. "hinge": SuperPoint's descriptor loss over all pairs of cells. One cell gives its
+        descriptor, the other cell gives its one-hot class. Pairs of one class are positive, all other pairs are
+        negative.
     identity_weight : float
         Weight of the identity loss.
     lambda_d, positive_margin, negative_margin : float
-        Parameters of the hinge loss (the paper's Table 1).
+        Parameters of the hinge loss, as in Table 1 of the paper: weight of the positive pairs, and the two margins.
 
     Examples
     --------
@@ -103,13 +104,14 @@ class LossConfig:
 
 @dataclass(frozen=True)
 class Phase:
-    """A part of a training, with its own trained layers and its own severity.
+    """A part of a training. Each phase trains its own choice of layers, at its own severity.
 
     Attributes
     ----------
     samples : int
+        Number of samples in the phase.
     trains : str
-        Layers that are trained: "all", or "attached" (only the attached layers).
+        Layers that are trained: "all" or "attached" (the attached layers alone).
     severity : (float, float)
         Severity of the degradations at the first and at the last sample of the phase, from 0 to 1; see
         :func:`kpbench.training.make_batch`.
@@ -128,7 +130,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A training recipe: it determines a training, together with photographs, designs and initial weights.
+    """A training recipe. Recipe, photographs, designs and initial weights together determine a training.
 
     Attributes
     ----------
@@ -139,25 +141,25 @@ class Recipe:
     samples : SampleConfig
     loss : LossConfig
     batch : int
-        Samples per step, over all processes.
+        Number of samples per step, summed over all processes.
     optimizer : str
         "adam" (weight decay as an L2 penalty, as in the paper) or "adamw".
     lr, weight_decay : float
         Learning rate and weight decay.
     warmup : int
-        Samples over which the learning rate rises from 0.
+        Number of samples during which the learning rate rises from 0 to its full value.
     schedule : str
         "step" (the learning rate is multiplied by ``decay`` at each entry of ``decay_at``) or "cosine" (the learning
         rate falls from ``lr`` to ``decay`` · ``lr``, along half a cosine).
     decay : float
         Factor of the learning rate, see ``schedule``.
     decay_at : tuple of int
-        Positions in the training, in samples.
+        Numbers of samples after which the learning rate falls, see ``schedule``.
     ema : float
         Decay per step of the running mean of the weights; the running mean is validated and exported.
     precision : str
-        "fp32" or "bf16" (autocast). "bf16" is twice as fast on a GPU or on a processor with AMX or AVX512-BF16, but far
-        slower on other processors.
+        "fp32" or "bf16" (autocast). "bf16" is twice as fast on a GPU or on a processor with AMX or AVX512-BF16. "bf16"
+        is far slower on other processors.
     compile : bool
         Whether ``torch.compile`` is used.
 
@@ -240,7 +242,7 @@ CHOICES = {  # key → its allowed values
 
 
 def shipped_recipes() -> dict[str, Path]:
-    """Return the files of the recipes that ship with kpbench, keyed by the file name without its suffix."""
+    """Return the files of the shipped recipes; each key is the file name without its suffix."""
     return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.toml"))}
 
 
@@ -250,7 +252,8 @@ def load_recipe(name: str | Path) -> Recipe:
     Raises
     ------
     DataError
-        If there is no such recipe, or if the file cannot be read, is no TOML, has an unknown key or a wrong value.
+        If no shipped recipe has this name, or if the file cannot be read, is no TOML, or has an unknown key or a wrong
+        value.
 
     Examples
     --------
@@ -272,7 +275,7 @@ def parse_recipe(content: Mapping[str, Any], source: str) -> Recipe:
 
 
 def _parse(cls: type[T], table: TomlTable) -> T:
-    """Return the dataclass that a table describes; the types of the fields say which values are expected."""
+    """Return the dataclass that a table describes. Each value must have the type of its field."""
     values = {key: _parse_field(table, key, kind) for key, kind in get_type_hints(cls).items() if key in table}
     missing = [f.name for f in fields(cls) if not _has_default(f) and f.name not in values]  # type: ignore[arg-type]
     if missing:

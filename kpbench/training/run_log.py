@@ -22,7 +22,9 @@ Record = Callable[[TrainingState, Mapping[str, Any]], None]
 
 @contextmanager
 def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
-    """Open ``log.jsonl`` and, if ``tensorboard``, TensorBoard's files; yield a function that appends figures.
+    """Open the log ``log.jsonl``; yield a function that appends figures.
+
+    ``tensorboard`` : also write the figures to TensorBoard's files.
 
     If ``active`` is false, no file is opened, and the function does nothing.
     """
@@ -55,7 +57,7 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
 
 @contextmanager
 def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
-    """Show a progress bar over samples, only on a terminal; yield a function that sets the step and the text."""
+    """Show a progress bar that counts samples, only on a terminal; yield a function that sets its step and its text."""
     batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
     hidden = not active or not sys.stderr.isatty()
     with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
@@ -68,7 +70,7 @@ def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, st
 
 
 class LossMeter:
-    """Mean losses since the last reading, and samples per second since the training began or was resumed."""
+    """Meter of the mean losses since the last :meth:`read`, and of the samples per second since this run began."""
 
     def __init__(self, state: TrainingState, device: torch.device, began: float) -> None:
         self._began, self._first = began, state.step
@@ -93,13 +95,13 @@ class LossMeter:
 
 
 class Timer:
-    """A timer that tells whether a time has passed since the timer was made or restarted."""
+    """A timer that is due when ``seconds`` have passed since its start or its last restart."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds, self._since = seconds, time.monotonic()
 
     def due(self) -> bool:
-        """Return whether the time has passed."""
+        """Return whether the timer is due."""
         return time.monotonic() - self._since > self._seconds
 
     def restart(self) -> None:

@@ -31,7 +31,7 @@ def train_step(
     Returns
     -------
     detector_loss, identity_loss : Tensor
-        Losses before the step.
+        Losses of the batch with the weights before the step.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def train_step(
 
 @torch.no_grad()
 def _update_mean(state: TrainingState) -> None:
-    """Move the running mean towards the weights, faster in the first steps."""
+    """Move the running mean towards the weights; the running mean moves faster in the first steps."""
     decay = min(state.recipe.ema, (1 + state.step) / (10 + state.step))
     mean, weights = state.mean.state_dict(), state.network.state_dict()
     real = [k for k in mean if mean[k].is_floating_point()]

@@ -1,4 +1,4 @@
-"""Validation: the keypoints that a network finds in scenes outside its training."""
+"""Validation: the share of keypoints that a network finds in samples on which it was not trained."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def make_validation_sets(
     Returns
     -------
     list of (str, Batch)
-        "clean": ``count`` whole images that are not degraded. "paper": the same images with the paper's
-        deteriorations. "hard": 8 · ``count`` crops at full severity.
+        "clean": ``count`` whole images that are not degraded. "paper": the same images, degraded as in the paper.
+        "hard": 8 · ``count`` crops at full severity.
     """
     scenes = replace(recipe.samples, kind="scenes", size=(640, 480), set_size=count)
     crops = replace(recipe.samples, kind="crops", size=(128, 128))
-    seed = recipe.seed + 2**31  # gives other random numbers than the training batches
+    seed = recipe.seed + 2**31  # the random numbers differ from those of the training batches
     return [
         ("clean", make_batch(scenes, patches, photos, seed, 0, count, 0.0)),
         ("paper", make_batch(scenes, patches, photos, seed, 0, count, 1.0)),
@@ -48,15 +48,15 @@ def validate_network(network: SuperPoint, sets: ValidationSets) -> dict[str, flo
     """Measure how many keypoints a network finds, at the default threshold and without verification.
 
     :func:`kpbench.score` cannot score crops, for two reasons. First, its tolerance ε is relative to the radius of a
-    patch, and the keypoints of crops hold no radius. Second, crops have ignored keypoints; a detection near an ignored
-    keypoint is no false alarm.
+    patch, and the keypoints of crops hold no patch radius. Second, crops have ignored keypoints, and a detection near
+    an ignored keypoint is no false alarm.
 
     Returns
     -------
     dict
-        For each set NAME: ``NAME_found_3px`` and ``NAME_found_1px``, the shares of keypoints with a detection within
-        3 px and 1 px; ``NAME_id``, the share of right identities among the keypoints found within 3 px;
-        ``NAME_alarms``, the number of false alarms per image.
+        Four figures for each set NAME. ``NAME_found_3px``: share of keypoints with a detection within 3 px.
+        ``NAME_found_1px``: share of keypoints with a detection within 1 px. ``NAME_id``: share of the keypoints found
+        within 3 px whose nearest detection has the right design. ``NAME_alarms``: number of false alarms per image.
     """
     network.eval()
     device = next(network.parameters()).device

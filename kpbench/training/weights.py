@@ -1,4 +1,7 @@
-"""Initial weights from a published file, an exported file or a checkpoint; the network may grow from a smaller one."""
+"""Initial weights: from a published file, an exported file or a checkpoint.
+
+If the initial weights belong to a smaller network, the smaller network grows (:func:`grow_network`).
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,7 @@ from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
 
 BATCHNORM_PX = 128 * 96 * 96
-"""Total number of px in the samples that initialise BatchNorm; between 2 and 128 samples are used."""
+"""Total number of px of the samples that initialise BatchNorm. The number of samples is limited to 2 to 128."""
 
 
 def load_initial_weights(
@@ -32,7 +35,9 @@ def load_initial_weights(
     backgrounds: str | Path | None,
     device: torch.device,
 ) -> str:
-    """Load initial weights into a fresh training. If the weights belong to a network of other sizes, grow that network.
+    """Load initial weights into a fresh training.
+
+    If the weights belong to a network of other sizes, :func:`grow_network` starts the network from that network.
 
     Parameters
     ----------
@@ -84,7 +89,8 @@ def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[di
         ``superpoint`` or ``superpoint-small`` (the shipped weights), an ONNX file of ``kpbench export-model``, a
         checkpoint (its running mean is read), or published SuperPoint weights.
     patches : sequence of Patch
-        Designs of the training. The attached layer of the ID head is left out if it was trained on other designs.
+        Designs of the training. If the weights were trained on other designs, the weights of the ID head's attached
+        layer are left out.
 
     Returns
     -------
@@ -108,7 +114,7 @@ def read_initial_weights(name: str | Path, patches: Sequence[Patch]) -> tuple[di
 
 
 def read_weights(path: str | Path) -> dict[str, Tensor]:
-    """Read a state-dict from a safetensors file or a pickle. Only tensors are unpickled.
+    """Read a state-dict from a safetensors file, or from a PyTorch file of which only tensors are unpickled.
 
     Raises
     ------
@@ -157,7 +163,7 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     network : SuperPoint
         Changed in place.
     weights : dict of str to Tensor
-        The state-dict. A state-dict without any BatchNorm is allowed, see :func:`restore_batchnorm`.
+        The state-dict. BatchNorm may be missing from the whole state-dict; see :func:`restore_batchnorm`.
     source : str
         Name of the file, for messages.
 
@@ -174,7 +180,7 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
     """
     own = network.state_dict()
     bare = is_folded(weights)
-    # BatchNorm's counter of batches is no weight, and some files lack the counter
+    # BatchNorm counts its batches; this count is no weight, and some files lack the count
     ours = {name for name in own if not (name.endswith("num_batches_tracked") or (bare and ".bn." in name))}
     needed = {name for name in ours if "_attached" not in name}
     given = {name for name in weights if not name.endswith("num_batches_tracked")}
@@ -192,15 +198,16 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
 
 
 def is_folded(weights: Mapping[str, Tensor]) -> bool:
-    """Return whether a state-dict has no BatchNorm. An exported file has none, because the export folds BatchNorm."""
+    """Return whether a state-dict has no BatchNorm. The export folds BatchNorm into the convolutions."""
     return not any(".bn." in name for name in weights)
 
 
 def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iterable[nn.Module] | None = None) -> None:
-    """Make each BatchNorm the identity on given inputs: set its statistics, weight and bias from the inputs.
+    """Reverse the folding of BatchNorm: make each BatchNorm the identity, so that the network can be trained again.
 
-    This is the reverse of folding: the network then computes what its convolutions alone compute, and can be trained.
-    ``layers`` : the BatchNorms that are changed; None: all.
+    The mean and the variance of the features that reach a BatchNorm, measured on ``inputs``, set the statistics, the
+    weight and the bias of this BatchNorm. ``inputs`` : arguments of the network. ``layers`` : the BatchNorms that are
+    changed; None: all.
     """
 
     def become_identity(module: nn.Module, given: tuple[Tensor]) -> None:
@@ -225,20 +232,20 @@ def restore_batchnorm(network: nn.Module, inputs: Iterable[Tensor], layers: Iter
 def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, source: str) -> str:
     """Start a network from a trained network of less width or another depth (Chen et al., *Net2Net*, ICLR 2016).
 
-    In each layer, the channels of the smaller network fill the first channels. The other channels keep their random
-    weights; the weights from these other channels to trained channels are 0. In each stage, convolutions that the
-    smaller network lacks become the identity, and surplus convolutions of the smaller network are left out. The network
-    then computes what the smaller network computes, unless convolutions are left out or the two networks halve the
-    image in different ways.
+    In each layer, the first channels are copied from the smaller network; these are the trained channels. The other
+    channels keep their random weights. The weights from random channels to trained channels are 0. In each stage,
+    convolutions that the smaller network lacks become the identity, and surplus convolutions of the smaller network are
+    left out. The network then computes the same outputs as the smaller network, with two exceptions: if convolutions
+    are left out, or if the two networks halve the image in different ways.
 
     Parameters
     ----------
     network : SuperPoint
         Changed in place.
     smaller : SuperPoint
-        With BatchNorm, see :func:`restore_batchnorm`.
+        The trained network, with BatchNorm; see :func:`restore_batchnorm`.
     images : Tensor of shape (B, 1, H, W)
-        Images in [0, 1]. Each added convolution is the identity; its BatchNorm becomes the identity on these images.
+        Images in [0, 1]. On these images, the BatchNorm of each added convolution becomes the identity.
     source : str
         Name of the smaller network, for messages.
 
@@ -250,11 +257,11 @@ def grow_network(network: SuperPoint, smaller: SuperPoint, images: Tensor, sourc
     Raises
     ------
     DataError
-        If a layer of the smaller network is wider than the same layer of the network, or if BatchNorm stands after the
-        activation in one of the networks.
+        If a layer of the smaller network is wider than the same layer of the network, or if one of the two networks has
+        BatchNorm after the activation.
     """
-    # with BatchNorm after the activation, an added convolution cannot be the identity: BatchNorm gives negative values,
-    # and the activation cuts off negative values
+    # with BatchNorm after the activation, an added convolution cannot be the identity: the BatchNorm before it gives
+    # negative values, and the activation after it cuts off negative values
     if "after" in (smaller.config.norm, network.config.norm):
         raise DataError(f"{source}: differs from [network], and can grow only where norm is 'before' in both")
     identities: list[nn.Module] = []
@@ -283,7 +290,7 @@ def _blocks(stage: nn.Module) -> list[nn.Module]:
 
 
 def _copy_channels(layer: nn.Module, given: nn.Module, inputs: int, place: str) -> int:
-    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return their number.
+    """Copy a trained convolution and its BatchNorm into the first channels of a layer; return the number of channels.
 
     ``inputs`` : number of input channels that are trained. ``place`` : name of the layer, for messages.
     """

@@ -1,4 +1,4 @@
-"""References to images of datasets; worker processes take the references and read the images."""
+"""References to images of datasets. Worker processes receive references and read the images themselves."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class ImageRef:
-    """Reference to an image of a dataset. The process that needs the image reads the image.
+    """Reference to an image of a dataset.
 
     Attributes
     ----------
@@ -42,18 +42,18 @@ class ImageRef:
     index: int
 
     def read(self) -> tuple[UInt8, NDArray[Any]]:
-        """Return the image in grey and its true keypoints."""
+        """Read the image. Return the image in grey, and its true keypoints."""
         image, keypoints = _open_dataset(self.folder, self.fingerprint)[self.index]
         return to_grey(image), keypoints
 
     def rng(self) -> np.random.Generator:
-        """Return a generator of random numbers, seeded by the content of the dataset and by the index."""
+        """Return a generator of random numbers, seeded with the fingerprint of the dataset and the index."""
         return np.random.default_rng([int(self.fingerprint[:8], 16), self.index])
 
 
 @cache
 def _open_dataset(folder: Path, fingerprint: str) -> Dataset:
-    """Open a dataset once per process. Another fingerprint shows that the dataset in the folder was replaced."""
+    """Open a dataset, once per process. The fingerprint is a key of the cache: a replaced dataset is opened again."""
     return open_dataset(folder)
 
 
@@ -65,12 +65,12 @@ def image_refs(dataset: Dataset) -> list[ImageRef]:
 def map_images(
     work: Callable[[ImageRef, Given], Result], dataset: Dataset, given: Iterable[Given], workers: int, label: str
 ) -> list[Result]:
-    """Return ``work(image, argument)`` for every image of a dataset and its argument.
+    """Return ``work(image, argument)`` for every image of a dataset, in the order of the images.
 
     Parameters
     ----------
     work : callable
-        Must be picklable.
+        A picklable function of the image and of the image's argument.
     dataset : Dataset
     given : iterable
         One argument per image, in the order of the images.

@@ -1,11 +1,14 @@
 """Training of the ellipse network (:func:`kpbench.detectors.verification.find_ellipses`).
 
-The ellipse network sees the surroundings of a place in four octaves. It gives the log odds that the place lies on a
-patch, the centre of the patch, and the ellipse that the patch fills; the design of the patch plays no part. The network
-is trained on places that the detector's network finds, and on places around every keypoint. The surroundings of most
-places are rotated and scaled at random; batches of surroundings are mirrored at random. In an image with designs that
-the detector's network does not know, only the places around keypoints are used. Finally, the log odds are calibrated on
-a test dataset.
+A place is a point of an image. The ellipse network sees the surroundings of a place at four scales, which are octaves.
+The network gives the log odds that the place lies on a patch, the centre of the patch, and the ellipse that the patch
+fills. The network does not learn the design of the patch.
+
+1. :func:`collect_places` collects the places of each training image. Some places are candidates of the detector's
+   network. The other places are drawn at random around the true keypoints. If an image shows a design that the
+   detector's network does not know, the candidates are left out. Most surroundings are rotated and scaled at random.
+2. The network is trained on batches of places; each batch is mirrored at random.
+3. :func:`calibrate_log_odds` calibrates the log odds on the candidates in a test dataset.
 """
 
 from __future__ import annotations
@@ -48,20 +51,20 @@ from all centres lies on no patch."""
 EMPTY_PLACES = 14
 """Largest number of places per training image that lie on no patch."""
 MADE_PLACES, MADE_DEVIATION = 3, 0.22
-"""Number of places made around each keypoint of a training image, and the standard deviation of their offsets from the
-keypoint in x and in y, in short semi-axes."""
+"""Number of places drawn around each keypoint of a training image, and standard deviation of their offsets from the
+keypoint: in x and in y, in short semi-axes."""
 ROTATED_SHARE, OCTAVES_OF_SCALE = 0.7, 0.35
-"""Share of training places whose surroundings are rotated and scaled, and largest change of scale in octaves."""
+"""Probability that the surroundings of a training place are rotated and scaled; largest change of scale, octaves."""
 USUAL_LOG_RADIUS = 2.5
-"""Natural logarithm of a usual radius in px; an untrained network predicts about this radius."""
+"""Natural logarithm of a usual semi-axis in px. An untrained network predicts semi-axes of about this length."""
 RADII_PX = ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000))
-"""Ranges of the short semi-axis in the report, px."""
+"""Ranges of the short semi-axis, px. The report has one line for each range."""
 LOG_ODDS = (-8, -7, -6, -5, -4, -2, 0)
-"""Thresholds of the log odds in the report."""
+"""Thresholds of the log odds. The report has one line for each threshold."""
 
 
 class EllipseNetwork(nn.Module):
-    """Network that takes the surroundings of places, and returns log odds and ellipses."""
+    """Network that takes the surroundings of places. It returns log odds and ellipses."""
 
     def __init__(self, width: int = 32) -> None:
         super().__init__()
@@ -73,10 +76,10 @@ class EllipseNetwork(nn.Module):
         )
 
     def forward(self, surroundings: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log odds (n,), shift (n, 2) and log map (n, 2, 2).
+        """Return log odds (n,), shift (n, 2) and log map (n, 2, 2) of n places.
 
         ``surroundings`` : (n, OCTAVES, VIEW_PX, VIEW_PX), grey levels.
-        :func:`kpbench.detectors.verification.move_poses` applies the shift and the log map.
+        :func:`kpbench.detectors.verification.move_poses` defines shift and log map.
         """
         centred = surroundings - surroundings.mean((2, 3), keepdim=True)
         out = self.body(centred / (centred.square().mean((2, 3), keepdim=True).sqrt() + 2.0))
@@ -85,14 +88,14 @@ class EllipseNetwork(nn.Module):
 
 
 class Places(NamedTuple):
-    """n places of one image.
+    """Surroundings of n places of one image, and the targets of the network.
 
     Attributes
     ----------
     surroundings : ndarray of shape (n, OCTAVES, VIEW_PX, VIEW_PX), float16
     on_patch : ndarray of shape (n,), bool
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2), float32
-        Targets of the network; 0 for places on no patch.
+        Shift and log map that the network should return; 0 for places on no patch.
     """
 
     surroundings: NDArray[np.float16]
@@ -129,13 +132,13 @@ def train_ellipse(
     datasets : sequence of Dataset
         Synthetic images to train on.
     test : Dataset
-        Synthetic images for the report, and for the calibration of the log odds.
+        Synthetic images on which the log odds are calibrated and the report is measured.
     out : Path
-        Folder for the file.
+        Folder in which the file is written.
     epochs, batch : int
         Number of passes over all places, and number of places per step.
     from_shipped : bool
-        Start from the shipped weights. With ``epochs=0``, the report describes the shipped weights.
+        Start from the shipped weights. With ``epochs=0``, the weights are only calibrated, reported and written.
     workers : int
         Number of worker processes that collect places; 0: this process collects the places.
     threads : int, optional
@@ -174,17 +177,18 @@ def train_ellipse(
 
 @cache
 def _detector() -> SmallSuperPointDetector:
-    """Return the detector whose places are collected; each process loads the detector once."""
+    """Return the detector whose candidates become places; each process loads the detector once."""
     return SmallSuperPointDetector()
 
 
 def collect_places(image: ImageRef, train: bool) -> Places:
     """Return the places of one image.
 
-    Places that lie between ``ON_PATCH`` and ``OFF_PATCH`` are left out.
+    The detector's candidates become places. A candidate that lies neither on a patch (``ON_PATCH``) nor on no patch
+    (``OFF_PATCH``) is left out.
 
     ``train`` : True adds places around the keypoints, keeps at most ``EMPTY_PLACES`` places on no patch, and rotates
-    and scales most surroundings. False returns the detector's places unchanged.
+    and scales most surroundings. False does none of these three things.
     """
     grey, keypoints = image.read()
     rng = image.rng()
@@ -217,7 +221,7 @@ def collect_places(image: ImageRef, train: bool) -> Places:
 
 
 def _match_places(xy: Float, keypoints: NDArray[Any]) -> tuple[Int, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the nearest keypoint of each place, whether the place lies on a patch, and whether it lies on no patch."""
+    """Return the nearest keypoint of each place, whether the place is on a patch, and whether it is on no patch."""
     if not len(keypoints):
         return np.zeros(len(xy), np.int64), np.zeros(len(xy), bool), np.ones(len(xy), bool)
     distance = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"])
@@ -231,7 +235,7 @@ def _concatenate(parts: Sequence[Places]) -> PlaceTensors:
 
 
 def _train(places: PlaceTensors, epochs: int, batch: int, from_shipped: bool) -> EllipseNetwork:
-    """Minimise the cross-entropy of the log odds and, on patches, the smooth L1 error of shift and log map."""
+    """Train with cross-entropy for the log odds, and with smooth L1 loss for shift and log map of places on patches."""
     torch.manual_seed(0)
     network = EllipseNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     count = len(places.on_patch)
@@ -254,7 +258,10 @@ def _train(places: PlaceTensors, epochs: int, batch: int, from_shipped: bool) ->
 
 
 def calibrate_log_odds(network: EllipseNetwork, places: PlaceTensors) -> None:
-    """Scale and shift the network's log odds by maximum likelihood on places (Platt, *Probabilistic outputs*, 1999)."""
+    """Replace the network's log odds z by a·z + b, with a and b of maximum likelihood on places.
+
+    The method is Platt scaling (Platt, *Probabilistic outputs for support vector machines*, 1999).
+    """
     with torch.inference_mode():
         odds = torch.cat([network(part.float())[0] for part in torch.split(places.surroundings, 1024)])
     odds, on = odds.clone(), places.on_patch.float()
@@ -275,7 +282,7 @@ def calibrate_log_odds(network: EllipseNetwork, places: PlaceTensors) -> None:
 
 
 def _mirror(places: PlaceTensors) -> PlaceTensors:
-    """Mirror a batch at random in x, in y or in both, and exchange x and y at random."""
+    """Mirror a batch in x, mirror it in y, and exchange x and y, each with probability 0.5."""
     surroundings, on, shift, log_map = places
     surroundings = surroundings.float()
     for axis in (0, 1):
@@ -290,11 +297,12 @@ def _mirror(places: PlaceTensors) -> PlaceTensors:
 
 @torch.inference_mode()
 def _report(network: EllipseNetwork, places: PlaceTensors, images: int, say: Say) -> None:
-    """Report how near the ellipses are to the truth, and how many places each threshold of the log odds keeps.
+    """Report the errors of the ellipses, and how many places each threshold of the log odds keeps.
 
-    Each range of the short semi-axis has a line. The line gives the shares of places within 0.1 and 0.2 long semi-axes
-    of the true centre, the same shares of predicted centres, and the shares of ellipses whose semi-axes are wrong by at
-    most a tenth and a fifth.
+    The report has a line for each range of the short semi-axis. All shares are shares of the places on patches.
+    "before": share of places within 0.1, and within 0.2, long semi-axes of the true centre. "after": the same two
+    shares for the predicted centres. "semi-axes": share of ellipses whose semi-axes are wrong by less than about a
+    tenth, and by less than about a fifth.
     """
     surroundings, on, shift, log_map = places
     out = [network(part.float()) for part in torch.split(surroundings, 1024)]

@@ -1,4 +1,4 @@
-"""The network of a judge; both judges have the same layers."""
+"""The network of a judge. The first judge and the second judge have the same layers."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ from kpbench.types import Float
 
 
 class Judge(nn.Module):
-    """Network that takes views and evidence of hypotheses, and returns log odds and corrections of the pose.
+    """Network that takes views and evidence of hypotheses. It returns log odds and corrections of the poses.
 
-    ``evidence`` : training samples (n, columns); their mean and standard deviation standardise each column.
+    ``evidence`` : evidence (n, columns) of the training samples. The network standardises each column of its input with
+    the mean and the standard deviation of the same column of ``evidence``.
+    ``width`` : number of channels of the first layers.
     """
 
     mean: Tensor
@@ -38,12 +40,12 @@ class Judge(nn.Module):
         self.pose = nn.Sequential(nn.Linear(size, 64), nn.ReLU(), nn.Linear(64, 5))
 
     def forward(self, view: Tensor, evidence: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return log odds (n,), shift (n, 2) and log map (n, 2, 2).
+        """Return log odds (n,), shift (n, 2) and log map (n, 2, 2) of n hypotheses.
 
         :func:`kpbench.detectors.hypotheses.judge_inputs` makes the inputs ``view`` (n, 2, VIEW_PX, VIEW_PX) and
-        ``evidence`` (n, columns).
+        ``evidence`` (n, columns). :func:`kpbench.detectors.verification.move_poses` defines shift and log map.
         """
-        # clipped, so that evidence unlike the training samples has a limited effect
+        # the limits bound the effect of evidence that differs much from the training samples
         standard = ((evidence - self.mean) / self.deviation).clamp(-4, 4)
         if self.training:
             standard = standard + 0.05 * torch.randn_like(standard)
@@ -61,7 +63,10 @@ def input_tensors(hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Ten
 
 @torch.inference_mode()
 def apply_judge(network: Judge, hypotheses: Hypotheses, patches: Sequence[Patch]) -> tuple[Float, Hypotheses]:
-    """Judge hypotheses like :func:`kpbench.detectors.verification.judge`, but with a network in PyTorch."""
+    """Do the work of :func:`kpbench.detectors.verification.judge` with a network in PyTorch.
+
+    Return the log odds of the hypotheses, and the hypotheses with corrected poses.
+    """
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     odds, shift, log_map = (part.numpy() for part in network(*input_tensors(hypotheses, patches)))

@@ -1,4 +1,7 @@
-"""Report on the judges: detection scores on a test dataset at several rates of false alarms."""
+"""Report on the judges: detection scores on a test dataset.
+
+The detection score is the share of true keypoints that are detected. A false alarm is a detection that is not right.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +23,15 @@ from kpbench.training.verifier.small_networks import Say
 from kpbench.types import Float
 
 FALSE_ALARM_RATES = (0.03, 0.05, 0.1, 0.15, 0.25, 0.5, 0.73)
-"""False alarms per image."""
+"""False alarms per image. The report gives the detection score at each of these rates."""
 REPORTED_SCORES = (0.3, 0.5)
-"""Thresholds of the score; the score is a probability."""
+"""Thresholds of the probability that a detection is right. The report gives the detection score at each threshold."""
 
 
 def report_judges(
     looks: Sequence[ImageLooks], fits: Sequence[ImageFits], second: Judge, patches: Sequence[Patch], say: Say
 ) -> None:
-    """Report the detection scores of the network's candidates, of the first judge, and of the second judge."""
+    """Report the detection scores of the candidates, of the first judge, and of the second judge."""
     truths, images = sum(len(image.keypoints) for image in looks), len(looks)
     say(f"{images} images, {truths} keypoints")
     say("false alarms per image     " + "".join(f"{rate:8}" for rate in FALSE_ALARM_RATES))
@@ -54,7 +57,10 @@ def report_judges(
 
 
 def _report_scores(name: str, of_images: Iterable[tuple[Float, NDArray[np.bool_]]], truths: int, say: Say) -> None:
-    """Report detection scores; each image gives the log odds of its detections and whether each detection is right."""
+    """Report the detection scores of one stage.
+
+    ``of_images`` : for each image, the log odds of its detections, and whether each detection is right.
+    """
     parts = list(of_images)
     log_odds, right = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(-log_odds, kind="stable")
@@ -81,7 +87,10 @@ def _count_explained(
 def _select_reported(
     log_odds: Float, hypotheses: Hypotheses, keypoints: NDArray[Any], patches: Sequence[Patch]
 ) -> tuple[Float, NDArray[np.bool_]]:
-    """Return the log odds of the hypotheses that a detector without threshold reports, and whether each is right."""
+    """Return the log odds of the hypotheses that a detector without a threshold would report.
+
+    Also return whether each of these hypotheses is right.
+    """
     best = select_likeliest(hypotheses.place, log_odds)
     hypotheses, log_odds = hypotheses[best], log_odds[best]
     reach = np.maximum(Decoding.separation_px, DISC_SHARE * short_semi_axis(hypotheses.A))

@@ -1,4 +1,9 @@
-"""Hypotheses of synthetic images; the judges are trained on these hypotheses."""
+"""Collection of the hypotheses on which the judges are trained and tested.
+
+The first judge sees a hypothesis twice. The first look is at the proposed pose. The second look is at the pose that the
+judge corrected at the first look. :func:`collect_looks` collects the hypotheses of both looks, with the shipped first
+judge. :func:`collect_fits` collects the fitted hypotheses, with the new first judge.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +36,9 @@ from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 from kpbench.types import Float, UInt8
 
 TRAINING_MARGIN = 1.0
-"""Amount by which training lowers the two thresholds of the log odds: for the second look and for the fit."""
+"""Amount by which training lowers two log-odds thresholds: ``SECOND_LOOK_LOG_ODDS`` and ``LEAST_FIT_LOG_ODDS``."""
 SPECKLED_EVERY = 3
-"""One training image in this many has specks."""
+"""Every third training image has specks."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +50,13 @@ class ImageLooks:
     keypoints : structured ndarray
         The true keypoints.
     candidate_score : ndarray of shape (n,)
-        Score of each candidate of the detector's network.
+        Score that the detector's network gives each candidate.
     candidate_right : ndarray of shape (n,), bool
-        Whether each candidate is right.
+        Whether each candidate, with its likeliest design, is right.
     first_look, second_look : Hypotheses
-        Hypotheses in the proposed poses, and hypotheses in the poses that the shipped first judge corrected.
+        Hypotheses in the proposed poses, and likely hypotheses in the poses that the shipped first judge corrected.
     shipped_log_odds : ndarray
-        Log odds by the shipped first judge for the hypotheses of ``first_look``, followed by those of ``second_look``.
+        Log odds from the shipped first judge: first for ``first_look``, then for ``second_look``.
     """
 
     keypoints: NDArray[Any]
@@ -69,7 +74,7 @@ class ImageFits:
     Attributes
     ----------
     log_odds : ndarray of shape (n,)
-        Log odds by the new first judge at the second look.
+        Log odds from the new first judge at the second look.
     corrected : Hypotheses
         The hypotheses before the fit, in the poses that the new first judge corrected at the second look.
     fitted : Hypotheses
@@ -83,7 +88,10 @@ class ImageFits:
 
 @cache
 def load_places_detector(path: Path | None) -> SuperPointDetector:
-    """Return the detector whose candidates are judged; each process loads the detector once."""
+    """Return the detector whose candidates are judged; each process loads the detector once.
+
+    ``path`` : file of ``kpbench export-model``. None: ``superpoint-small``.
+    """
     return SuperPointDetector(path) if path else SmallSuperPointDetector()
 
 
@@ -93,11 +101,12 @@ def _unpack_judge(packed: bytes) -> Judge:
 
 
 def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
-    """Return the hypotheses of one image at the two looks of the first judge.
+    """Return the hypotheses of one image at the two looks of the shipped first judge.
 
-    The threshold for the second look is lower than in a detector, by ``TRAINING_MARGIN``.
+    The threshold of the log odds for the second look is ``SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN``.
 
-    ``train`` : draw specks into one image in three.
+    ``detector_path`` : see :func:`load_places_detector`.
+    ``train`` : draw specks into every third image.
     """
     detector = load_places_detector(detector_path)
     grey, keypoints = read_image(image, train)
@@ -120,11 +129,12 @@ def _halve_memory(hypotheses: Hypotheses) -> Hypotheses:
 def collect_fits(
     detector_path: Path | None, packed_judge: bytes, train: bool, image: ImageRef, first_look: Hypotheses
 ) -> ImageFits:
-    """Return the hypotheses of one image after two looks of the new first judge and after the fit.
+    """Show the hypotheses of one image to the new first judge, twice; fit the likely hypotheses and return them.
 
-    ``train`` : draw the same specks as :func:`collect_looks`, and fit less likely hypotheses too. The first judge is
-    very sure about the images that trained it. Without less likely hypotheses, the second judge would see too few wrong
-    hypotheses.
+    ``packed_judge`` : the new first judge, pickled.
+    ``train`` : draw the same specks as :func:`collect_looks`, and lower both thresholds by ``TRAINING_MARGIN``. On its
+    own training images, the first judge gives wrong hypotheses very low log odds. With the usual thresholds, the second
+    judge would see too few wrong hypotheses.
     """
     patches, new_judge = load_places_detector(detector_path).patches, _unpack_judge(packed_judge)
     pyramids, margin = Pyramids(read_image(image, train)[0]), TRAINING_MARGIN if train else 0.0
@@ -141,10 +151,10 @@ def collect_fits(
 
 
 def read_image(image: ImageRef, speckle: bool) -> tuple[UInt8, NDArray[Any]]:
-    """Return one image in grey and its keypoints; with ``speckle``, one image in three gets specks beside its patches.
+    """Return one image in grey, and its keypoints.
 
-    Specks measure 1 to 6 px. Specks stand for hot pixels, dust, distant leaves and distant windows, which are often
-    mistaken for small patches.
+    ``speckle`` : draw specks beside the patches of every third image. A speck is 1 to 6 px wide. Specks imitate hot
+    pixels, dust, distant leaves and distant windows, which a detector often mistakes for small patches.
     """
     grey, keypoints = image.read()
     if not speckle or image.index % SPECKLED_EVERY:

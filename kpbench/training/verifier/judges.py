@@ -1,13 +1,18 @@
 """Training of the two judges (:func:`kpbench.detectors.verification.judge`).
 
-Both judges are small networks with the same layers, but different widths. A hypothesis is right if its centre lies near
-a keypoint of its design. The tolerance is 0.2 long semi-axes for the first judge, before the fit, and 0.1 long
-semi-axes for the second judge, after the fit. Of several rotations of a design at one place, only the best rotation is
-right. Each judge also learns to correct the pose.
+Both judges are small networks with the same layers, but different widths. A judge learns to tell right hypotheses from
+wrong hypotheses, and to correct their poses. :func:`kpbench.training.verifier.labels.label_hypotheses` defines "right".
 
-The first judge is trained on the hypotheses of its first look and of its second look. For the second look, the shipped
-first judge corrects the poses, because the new judge does not exist yet. A hypothesis that the shipped first judge
-rates correctly with high certainty is drawn rarely, and gets more weight if drawn.
+1. :func:`kpbench.training.verifier.judge_samples.collect_looks` collects the hypotheses that the first judge sees at
+   its first look and at its second look. Before the second look, the shipped first judge corrects the poses, because
+   the new first judge does not exist yet.
+2. The new first judge is trained on these hypotheses, before the fit. The centre of a right hypothesis may be 0.2 long
+   semi-axes away from the keypoint. Most hypotheses are easy: the shipped first judge rates them correctly, with high
+   certainty. Easy hypotheses are drawn rarely, and each drawn easy hypothesis gets more weight.
+3. :func:`kpbench.training.verifier.judge_samples.collect_fits` fits the hypotheses that the new first judge finds
+   likely.
+4. The second judge is trained on the fitted hypotheses. The centre of a right hypothesis may now be 0.1 long semi-axes
+   away from the keypoint.
 """
 
 from __future__ import annotations
@@ -47,10 +52,10 @@ from kpbench.training.verifier.small_networks import (
 from kpbench.types import Float
 
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
-"""Channels of the first layers of the first judge, and of the second judge."""
+"""Number of channels of the first layers: of the first judge, and of the second judge."""
 KNOWN_SHARE = 12.0
-"""Probability per epoch that a hypothesis rated correctly with log odds ±z is drawn: min(KNOWN_SHARE · exp(-z/2),
-1)."""
+"""In an epoch, a hypothesis is drawn with the probability min(KNOWN_SHARE · exp(-z/2), 1). z are the log odds that the
+shipped first judge gives to the true label of the hypothesis."""
 
 
 def train_judges(
@@ -71,10 +76,9 @@ def train_judges(
     Parameters
     ----------
     datasets, test, out, epochs, batch, from_shipped, workers, threads, say
-        As for :func:`kpbench.training.train_ellipse`. The report gives detection scores at several rates of false
-        alarms.
+        See :func:`kpbench.training.train_ellipse`. The report gives detection scores at several rates of false alarms.
     detector : Path, optional
-        Weights of the detector whose candidates are judged: a file of ``kpbench export-model``. None:
+        File of ``kpbench export-model`` that holds the detector whose candidates are judged. None: the detector
         ``superpoint-small``.
 
     Raises
@@ -118,7 +122,7 @@ def train_judges(
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings that the trainings of both judges share, see :func:`train_judges`."""
+    """Settings that the trainings of both judges share; see :func:`train_judges`."""
 
     patches: Sequence[Patch]
     epochs: int
@@ -135,9 +139,9 @@ class LabelledHypotheses:
     ----------
     hypotheses : Hypotheses
     right, near : ndarray of shape (n,), bool
-        Whether each hypothesis is right, and whether its pose is near enough to the truth to learn from.
+        Whether each hypothesis is right, and whether the judge learns the pose from this hypothesis.
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
-        Corrections that bring the poses to the truth.
+        Corrections that turn the poses into the true poses, see :func:`kpbench.detectors.verification.move_poses`.
     share : ndarray of shape (n,)
         Probability that a hypothesis is drawn in an epoch. The weight of the hypothesis is 1 / ``share``.
     """
@@ -159,7 +163,8 @@ def _label(
 ) -> LabelledHypotheses:
     """Label the hypotheses of many images.
 
-    ``known_log_odds`` : log odds by an earlier judge; 0 without an earlier judge.
+    ``known_log_odds`` : log odds (n,) that an earlier judge gave to the hypotheses; 0 without an earlier judge.
+    ``tolerance`` : largest distance of a right hypothesis from its keypoint, in long semi-axes.
     """
     pairs = list(zip(hypotheses, truths, strict=True))
     right = np.concatenate([label_hypotheses(part, patches, truth, tolerance) for part, truth in pairs])
@@ -170,7 +175,7 @@ def _label(
 
 
 def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
-    """Train the first judge on the hypotheses of both looks, which the shipped first judge has judged."""
+    """Train the first judge on the hypotheses of both looks, with the log odds from the shipped first judge."""
     hypotheses = [look for image in looks for look in (image.first_look, image.second_look)]
     truths = [image.keypoints for image in looks for _ in range(2)]
     known = np.concatenate([image.shipped_log_odds for image in looks])
@@ -179,16 +184,17 @@ def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
 
 
 def _train_second(fitted: Sequence[Hypotheses], truths: Sequence[NDArray[Any]], settings: _Settings) -> Judge:
-    """Train the second judge on fitted hypotheses, which no earlier judge has judged."""
+    """Train the second judge on the fitted hypotheses, without log odds from an earlier judge."""
     unknown = np.zeros(sum(map(len, fitted)))
     training = _label(fitted, settings.patches, truths, unknown, FIT_TOLERANCE)
     return _train(training, SECOND_JUDGE, SECOND_WIDTH, settings)
 
 
 def _train(training: LabelledHypotheses, name: str, width: int, settings: _Settings) -> Judge:
-    """Train a judge.
+    """Train a judge with two losses.
 
-    Minimise the cross-entropy of the log odds and, near the truth, the smooth L1 error of the pose.
+    The first loss is the cross-entropy of the log odds. The second loss is the smooth L1 loss of shift and log map, and
+    counts only hypotheses where ``training.near`` is true.
     """
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
@@ -222,7 +228,10 @@ def _train(training: LabelledHypotheses, name: str, width: int, settings: _Setti
 
 
 def _disturb(view: Tensor) -> Tensor:
-    """Return views whose image has other inks and a little noise; the design is not changed."""
+    """Change the contrast and the brightness of the image in each view, and add a little noise.
+
+    The second channel of a view, which shows the design, is not changed.
+    """
     shape = (len(view), 1, 1, 1)
     gain, offset = torch.exp(0.15 * torch.randn(shape)), 0.1 * torch.randn(shape)
     image = view[:, :1] * gain + offset + 0.1 * torch.rand(shape) * torch.randn_like(view[:, :1])

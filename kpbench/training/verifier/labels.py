@@ -1,4 +1,4 @@
-"""Labels of hypotheses: whether a hypothesis is right, and how far its pose is from the truth."""
+"""Labels of hypotheses: whether a hypothesis is right, and which correction turns its pose into the true pose."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Int
 
 POSE_TOLERANCE, FIT_TOLERANCE = 0.2, 0.1
-"""Largest distance between the centre of a right hypothesis and the true centre, before and after the fit, in long
-semi-axes."""
+"""Largest distance between the centre of a right hypothesis and the keypoint, in long semi-axes: before the fit, and
+after the fit."""
 NEAR_RADII = 0.5
-"""A judge learns the pose from hypotheses of the right design within this distance of a keypoint, in long semi-axes."""
+"""Largest distance between a hypothesis and its keypoint, in long semi-axes, at which a judge learns the pose."""
 LARGEST_LOG_MAP = 1.0
-"""A judge does not learn the pose from a hypothesis with a larger error in an entry of the log map."""
+"""Largest absolute value of an entry of the log map at which a judge learns the pose."""
 
 
 def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
@@ -29,9 +29,10 @@ def design_ids(hypotheses: Hypotheses, patches: Sequence[Patch]) -> Int:
 
 
 def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: float) -> NDArray[np.bool_]:
-    """Return whether each place (n, 2), px, lies near its nearest keypoint and has the patch ID of this keypoint.
+    """Return whether each place (n, 2), px, is right.
 
-    ``tolerance`` : largest distance, in long semi-axes of the keypoint.
+    A right place has the patch ID of its nearest keypoint, and lies at most ``tolerance`` long semi-axes away from this
+    keypoint.
     """
     if not len(keypoints):
         return np.zeros(len(xy), bool)
@@ -40,7 +41,10 @@ def mark_correct(xy: Float, patch_ids: Int, keypoints: NDArray[Any], tolerance: 
 
 
 def _nearest_keypoint(xy: Float, keypoints: NDArray[Any]) -> tuple[Int, Float]:
-    """Return the nearest keypoint (n,) of each place, and the distance (n,) in long semi-axes of that keypoint."""
+    """Return the index (n,) of the nearest keypoint of each place, and the distance (n,) to this keypoint.
+
+    Distances are measured in long semi-axes of the keypoint.
+    """
     distance = np.hypot(xy[:, :1] - keypoints["x"], xy[:, 1:] - keypoints["y"]) / keypoints["radius_major"]
     return distance.argmin(axis=1), distance.min(axis=1)
 
@@ -50,8 +54,9 @@ def label_hypotheses(
 ) -> NDArray[np.bool_]:
     """Return whether each hypothesis of an image is right.
 
-    A right hypothesis lies within ``tolerance`` long semi-axes of a keypoint and has the keypoint's design. Of several
-    rotations of a design at one place, only the best rotation is right.
+    A right hypothesis lies within ``tolerance`` long semi-axes of its nearest keypoint and has the design of this
+    keypoint. If several hypotheses of one place and one design fulfil both conditions, only the hypothesis whose
+    rotation is nearest to the true rotation is right.
     """
     right = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, tolerance)
     rows = np.flatnonzero(right)
@@ -59,7 +64,8 @@ def label_hypotheses(
         own, _ = _nearest_keypoint(hypotheses.xy[rows], keypoints)
         relative = np.linalg.inv(hypotheses.A[rows]) @ affine_at_centre(keypoints["H_patch2image"][own])
         angle = np.arctan2(relative[:, 1, 0] - relative[:, 0, 1], relative[:, 0, 0] + relative[:, 1, 1])
-        # a design that looks the same after half a turn has half as many templates, and repeats after half a turn
+        # a design that looks the same after half a turn has half as many templates as other designs, and its rotation
+        # is known only up to half a turn
         rotations = np.bincount(build_templates(patches).whole.rotated_design)
         period = (2 * np.pi * rotations / rotations.max())[hypotheses.design[rows]]
         error = np.abs((angle + period / 2) % period - period / 2)
@@ -72,14 +78,15 @@ def label_hypotheses(
 def pose_errors(
     hypotheses: Hypotheses, patches: Sequence[Patch], keypoints: NDArray[Any]
 ) -> tuple[NDArray[np.bool_], Float, Float]:
-    """Return the corrections that bring the poses of an image's hypotheses to the truth.
+    """Return the corrections that turn the poses of an image's hypotheses into the true poses.
 
     Returns
     -------
     near : ndarray of shape (n,), bool
-        Whether a hypothesis has the right design and a pose near the truth.
+        Whether a hypothesis has the design of its nearest keypoint and a pose near the true pose.
     shift, log_map : ndarray of shape (n, 2) and (n, 2, 2)
-        See :func:`kpbench.detectors.verification.move_poses`. Rows where ``near`` is false have no meaning.
+        Corrections, see :func:`kpbench.detectors.verification.move_poses`. Rows where ``near`` is false have no
+        meaning.
     """
     shift, log_map = np.zeros((len(hypotheses), 2)), np.zeros((len(hypotheses), 2, 2))
     near = mark_correct(hypotheses.xy, design_ids(hypotheses, patches), keypoints, NEAR_RADII)
@@ -100,6 +107,6 @@ def affine_at_centre(H: Float) -> Float:
 
 
 def log_ellipse(A: Float) -> Float:
-    """Return the logarithms (n, 2, 2) of the symmetric maps that take the unit circle to the same ellipses as A."""
+    """Return the matrix logarithms (n, 2, 2) of symmetric maps S. S maps the unit circle to the same ellipse as A."""
     square, axes = np.linalg.eigh(A @ A.transpose(0, 2, 1))
     return np.asarray(np.einsum("nij,nj,nkj->nik", axes, 0.5 * np.log(square), axes))

@@ -1,4 +1,4 @@
-"""Layers, training loop, shipped weights and export that the ellipse network and the judges share."""
+"""Functions that the ellipse network and the two judges share: layers, training loop, loading and export."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ from kpbench.writing import write_file
 WEIGHT_DECAY = 2e-2
 """Weight decay of AdamW."""
 LEARNING_RATE, CONTINUED_LEARNING_RATE = 3e-3, 2e-3
-"""Highest learning rate of a training from random weights, and from the shipped weights."""
+"""Highest learning rate of a training that starts from random weights, and of a training that starts from the shipped
+weights."""
 BATCHNORM_SAMPLES = 4096
-"""Number of samples whose statistics initialise BatchNorm in a training from the shipped weights."""
+"""Number of samples from which :func:`load_shipped` computes the statistics of BatchNorm."""
 OUTPUTS = ("odds", "shift", "log_map")
-"""Outputs of all three networks: log odds (n,), and the corrections of ``move_poses``, (n, 2) and (n, 2, 2)."""
+"""Names of the outputs of all three networks. ``odds`` (n,) are log odds.
+:func:`kpbench.detectors.verification.move_poses` defines ``shift`` (n, 2) and ``log_map`` (n, 2, 2)."""
 
 Say = Callable[[str], None]
 """A function that receives lines for the user."""
 
 
 def convolution(c_in: int, c_out: int, side: int = 3, stride: int = 1) -> list[nn.Module]:
-    """Return a convolution with BatchNorm and ReLU."""
+    """Return three layers: a convolution, BatchNorm and ReLU."""
     conv = nn.Conv2d(c_in, c_out, side, stride, side // 2, bias=False)
     return [conv, nn.BatchNorm2d(c_out), nn.ReLU()]
 
@@ -64,17 +66,18 @@ def train_one_cycle(
     batch: int,
     learning_rate: float,
 ) -> None:
-    """Minimise a loss with AdamW under one cycle of the learning rate (Smith and Topin, *Super-convergence*, 2019).
+    """Train with AdamW and the one-cycle schedule of the learning rate (Smith and Topin, *Super-convergence*, 2019).
 
     Parameters
     ----------
     network : nn.Module
-        Changed in place; in evaluation mode afterwards.
+        Changed in place; left in evaluation mode.
     loss : callable
-        Takes rows, and returns the loss of the samples at these rows.
+        Takes the rows of a batch. Returns the loss of the samples in these rows.
     draw_rows : callable
         Returns the rows of an epoch, in random order.
     epochs, batch : int
+        Number of epochs, and number of rows per step.
     learning_rate : float
         Highest learning rate of the cycle.
     """
@@ -104,10 +107,11 @@ def train_one_cycle(
 
 @torch.no_grad()
 def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> None:
-    """Load the shipped weights into a network; the file stores the weights of convolutions in 7 bits.
+    """Load the shipped weights into a network.
 
-    The shipped file has no BatchNorm. Each BatchNorm only adds the bias of its convolution; the inputs ``seen`` give
-    the statistics.
+    The shipped file stores the weights of convolutions as integers, and has no BatchNorm: the export folded each
+    BatchNorm into its convolution. The convolutions of the network have no bias. On the inputs ``seen``, each
+    BatchNorm is therefore made to add the stored bias and to change nothing else.
     """
     graph = onnx.load(WEIGHTS / f"{name}.onnx").graph
     stored = {tensor.name: to_array(tensor) for tensor in graph.initializer}
@@ -133,7 +137,7 @@ def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> Non
 def write_network(
     network: nn.Module, inputs: Sequence[str], seen: Sequence[tuple[Tensor, ...]], file: Path, say: Say
 ) -> None:
-    """Write a network as an ONNX file in 8-bit integers; the ONNX network takes any number of places.
+    """Write a network as an ONNX file in 8-bit integers; the ONNX network takes any number of samples.
 
     Parameters
     ----------
@@ -141,9 +145,10 @@ def write_network(
     inputs : sequence of str
         Names of the network's inputs.
     seen : sequence of tuple of Tensor
-        Inputs on which the ranges of the activations are measured.
+        Batches of inputs on which the ranges of the activations are measured.
     file : Path
     say : callable
+        Receives one line with the size of the file.
     """
     buffer = io.BytesIO()
     with warnings.catch_warnings():
