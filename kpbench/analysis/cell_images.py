@@ -1,8 +1,9 @@
 """Images of designs as matrix products: the inks of a design times the images of its cells.
 
-A design is a polar chequer. Its image is therefore *linear* in its inks. Every cell is rendered once per attitude, with
-exact area coverage. The image of a design, its derivatives and its correlations with other designs are then products of
-matrices with the vector of its inks. This makes the measures of a whole family of designs affordable.
+A design is a polar chequer: rings and sectors divide the design into cells, and each cell is black or white. The image
+of a design is therefore *linear* in the inks of the cells. Every cell is rendered once per attitude, with exact area
+coverage. The vector of a design's inks times the matrix of cell images then gives the image of the design. Such matrix
+products make the measures of a whole family of designs affordable.
 
 Conventions
 -----------
@@ -33,8 +34,8 @@ TILT_DIRECTIONS_DEG = (0.0, 45.0, 90.0, 135.0)  # directions in the image along 
 TURNS = 24  # number of rotations in the plane that are compared, 15 degrees apart
 WINDOW_PX = 5.0  # radius of the window
 BLUR = 0.2  # standard deviation, as a fraction of the window's radius
-HALF_SIDE_PX = int(WINDOW_PX) + 1  # px on each side of the middle px of the square around the window
-BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # margin around the square, for the blur
+HALF_SIDE_PX = int(WINDOW_PX) + 1  # the square around the window has this many px on each side of its middle px
+BLUR_MARGIN_PX = int(np.ceil(4 * BLUR * WINDOW_PX))  # margin around the square, as wide as the blur reaches
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ class PolarGrid:
 
     @classmethod
     def of(cls, patches: Sequence[Patch]) -> PolarGrid:
-        """Return the coarsest grid whose cells each have one ink in every design and every mirror image."""
+        """Return the grid with all radii and sector borders of the designs and of their mirror images."""
         radii = np.unique(np.round(np.concatenate([p.cells[0][1:] for p in patches]), 9))
         angles = np.concatenate([p.cells[1] for p in patches])
         angles = np.unique(np.round(np.append(angles, -angles) % 360.0, 9) % 360.0)
@@ -102,7 +103,7 @@ class PolarGrid:
         return inks.reshape(len(inks), *self.shape)[:, :, order].reshape(len(inks), -1)
 
     def cell_polygons(self, tolerance: float, reach: float = 0.0) -> list[Float]:
-        """Return every cell as a polygon of the patch frame.
+        """Return every cell as a polygon in the patch frame.
 
         Neighbouring cells share the vertices of their common border, so cells of one ink add up without a seam.
 
@@ -111,7 +112,7 @@ class PolarGrid:
         tolerance : float
             As for :func:`kpbench.geometry.flatten`, in disc radii.
         reach : float
-            Least radius to which the outermost ring extends, in disc radii.
+            The outermost ring extends at least to this radius, in disc radii.
         """
         radii = np.append(0.0, self.radii)
         radii[-1] = max(radii[-1], reach)
@@ -137,7 +138,7 @@ def _arc(radius: float, start_deg: float, end_deg: float, tolerance: float) -> F
 
 
 def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Float:
-    """Return foreshortened rotations of the unit disc.
+    """Return attitudes: rotations in the plane, foreshortened by every tilt.
 
     Parameters
     ----------
@@ -175,7 +176,7 @@ def attitudes(turns: int = TURNS, tilts_deg: Sequence[float] = TILTS_DEG) -> Flo
 def render_polygons(
     polygons: Sequence[Float], poses: Float, half: int, blur_px: float = 0.0, mix: Float32 | None = None
 ) -> Float32:
-    """Return the exact coverage of polygons in a square about the origin.
+    """Return the exact fraction of each pixel that polygons cover, in a square about the origin.
 
     Parameters
     ----------
@@ -214,7 +215,7 @@ def render_polygons(
 def blur_middle(stack: Float32, blur_px: float, half: int) -> Float32:
     """Return the middle ``2 * half + 1`` rows and columns of blurred square images, shape (N, side, side).
 
-    The images must be large enough that no kernel reaches beyond their borders.
+    The images must be large enough that no blur kernel of a middle pixel reaches beyond their borders.
     """
     wide = stack.shape[1] // 2
     if not blur_px:
@@ -253,14 +254,21 @@ def render_cells(
 
 
 def window_weights(attitude: Float) -> Float32:
-    """Return the weights of the window's pixels under each attitude, shape (P, pixels); they sum to 1."""
+    """Return the weights of pixels for each attitude, shape (P, pixels).
+
+    A weight is proportional to the share of the pixel that the foreshortened window covers. The weights of an attitude
+    sum to 1.
+    """
     disc = _arc(1.0, 0.0, 360.0, 1e-3)[:-1]
     weight = render_polygons([disc], _poses(WINDOW_PX * attitude), HALF_SIDE_PX)[:, 0]
     return np.asarray(weight / weight.sum(1, keepdims=True))
 
 
 def mean_free_images(weight: Float32, cells: Float32, inks: Float32) -> tuple[Float32, Float32]:
-    """Return images (n, pixels) of designs minus their weighted means, and weighted standard deviations (n,)."""
+    """Return the images (n, pixels) of designs, and the weighted standard deviations (n,) of these images.
+
+    The weighted mean of each image is subtracted.
+    """
     image = inks @ cells
     image -= (image @ weight)[:, None]
     spread: Float32 = np.sqrt(np.maximum((image * image) @ weight, np.float32(1e-9)))

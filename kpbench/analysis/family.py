@@ -1,9 +1,12 @@
 """The family of designs among which the search chooses.
 
 A design of the family has up to three semi-circles with radii of 1, 2/3, 1/2 or 1/3 and angles in steps of 45 degrees.
-The semi-circles are painted onto a black or a white disc; a semi-circle is black, white or inverts the ink below. The
-cells of a design are four rings by eight sectors. A design is therefore a code of 32 bits: bit ``8 * ring + sector`` is
-1 if the cell is black. The rotations and mirror images of a design count as one design.
+The semi-circles are painted onto a black or a white disc. A semi-circle is black, is white, or inverts the ink below. A
+*stroke* is a semi-circle of one radius, angle and ink.
+
+The cells of a design are four rings by eight sectors. A design therefore has a *code* of 32 bits: bit ``8 * ring +
+sector`` is 1 if the cell is black. A design, its rotations and their mirror images form a *class*. The *canonical code*
+of a class is the smallest code of its members.
 """
 
 from __future__ import annotations
@@ -28,7 +31,7 @@ Codes = NDArray[np.uint32]
 
 
 def _strokes() -> list[tuple[SemiCircle, np.uint32]]:
-    """Return every semi-circle with the bits of the cells that it covers."""
+    """Return every stroke with the bits of the cells that the stroke covers."""
     found = []
     for radius in FAMILY_RADII:
         rings = FAMILY_GRID.radii.index(radius) + 1
@@ -42,7 +45,7 @@ STROKES = _strokes()
 
 
 def paint_semicircle(codes: Codes, stroke: int) -> Codes:
-    """Return the designs with one more semi-circle; ``stroke`` is the index of the semi-circle in :data:`STROKES`."""
+    """Return the codes after one more semi-circle is painted; ``stroke`` is an index into :data:`STROKES`."""
     semicircle, bits = STROKES[stroke]
     if semicircle.ink == "invert":
         return codes ^ bits
@@ -50,7 +53,7 @@ def paint_semicircle(codes: Codes, stroke: int) -> Codes:
 
 
 def canonical_codes(codes: Codes) -> Codes:
-    """Return, for each design, the least code among its rotations and their mirror images."""
+    """Return the canonical code of each design's class."""
     rings = codes.astype("<u4").view(np.uint8).reshape(-1, 4)
     mirrored = np.packbits(np.unpackbits(rings[..., None], axis=-1), axis=-1, bitorder="little")[..., 0]
     orbit = [
@@ -62,7 +65,7 @@ def canonical_codes(codes: Codes) -> Codes:
 
 
 def code_of(patch: Patch) -> int:
-    """Return the canonical code of a design, which must fit on :data:`FAMILY_GRID`.
+    """Return the canonical code of a design whose cells lie on :data:`FAMILY_GRID`.
 
     Examples
     --------
@@ -77,16 +80,16 @@ def code_of(patch: Patch) -> int:
 
 @dataclass(frozen=True)
 class Family:
-    """All designs that can be painted, each with the fewest semi-circles that paint the design.
+    """All designs that can be painted, each with a shortest list of strokes that paints the design.
 
     Attributes
     ----------
     codes : ndarray of shape (N,), uint32
         Code of each design.
     parents : ndarray of shape (N,), int64
-        Index of the design without the last semi-circle; -1 for a bare disc.
+        Index of the design before the last stroke; -1 for a bare disc.
     strokes : ndarray of shape (N,), int64
-        Index of the last semi-circle in :data:`STROKES`; -1 for a bare disc.
+        Index of the last stroke in :data:`STROKES`; -1 for a bare disc.
     """
 
     codes: Codes
@@ -95,7 +98,7 @@ class Family:
 
     @cached_property
     def classes(self) -> Codes:
-        """Canonical codes of the designs, without repetition, ascending."""
+        """Canonical code of each class, ascending."""
         return np.unique(canonical_codes(self.codes))
 
     def patch(self, code: int, name: str, patch_id: int) -> Patch:
@@ -109,7 +112,7 @@ class Family:
 
 
 def enumerate_family() -> Family:
-    """Paint every design of the family, in order of the number of semi-circles.
+    """Paint every design of the family: first the bare discs, then designs of one, two and three strokes.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Figure of an analysis: a page with each design, its image in a camera, its measures and its distances to others."""
+"""Figure of an analysis: a page with each design, its image in a camera, its measures and its distances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ICON = 13.0  # radius of the outline of a design
 DOT = 1.9  # side of the square for a black pixel of the image
 BAR, BAR_STEP = 36.0, 4.6  # length of a full bar, and distance from one bar to the bar below
 BARS_X, PAIRS_X = 82.0, 146.0  # left borders of the column of measures and of the column of other designs
-FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # a bar of this value, or of a larger value, has its full length
+FULL_BOUND_PX, FULL_DISTANCE = 0.03, 0.3  # values at which a bar reaches its full length
 MOST_OTHERS = 6  # largest number of other designs in a row
 
 
@@ -74,7 +74,7 @@ def _icon(patch: Patch, x: float, y: float) -> list[Shape]:
 
 
 def _pixels(patch: Patch, x: float, y: float) -> list[Shape]:
-    """Return one black square per pixel of the image, larger for a darker pixel; the surroundings are mid-grey."""
+    """Return one black square per pixel, larger for darker pixels. The surroundings of the design are mid-grey."""
     half = int(WINDOW_PX) + 1
     grid = PolarGrid.of([patch])
     pose = np.array([[[WINDOW_PX, 0, 0], [0, WINDOW_PX, 0]]])

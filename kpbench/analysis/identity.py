@@ -1,8 +1,8 @@
 """Identity: how similar a design looks to other designs, to itself after a rotation, and to its mirror image.
 
-A distance is the root mean square of a difference of images, in units of the ink contrast. At a contrast of 180 grey
-levels, a distance of 0.1 means a root mean square of 18 grey levels. Noise must reach this difference before one design
-looks like another.
+The distance of two designs is the root mean square of the difference between their images, divided by the ink contrast
+(white minus black). At a contrast of 180 grey levels, a distance of 0.1 is a difference of 18 grey levels. Noise below
+this difference hardly makes one design look like the other.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ from kpbench.types import Float, Float32
 
 PARTS_OF_IDENTITY = (1.0, 3 / 4)  # fractions of the patch's radius that the window shows
 IDENTITY_STEPS = len(PARTS_OF_IDENTITY) * (1 + (len(TILTS_DEG) - 1) * len(TILT_DIRECTIONS_DEG))
-"""Number of calls of ``progress`` by :func:`correlation_and_distance`."""
+"""Number of steps that :func:`correlation_and_distance` reports."""
 
 
 def correlation_and_distance(
     grid: PolarGrid, inks: Float32, progress: Callable[[int], None] = lambda steps: None
 ) -> tuple[Float32, Float32]:
-    """Return how similar each pair of designs can look.
+    """Return the largest correlation and the smallest distance of each pair of designs, over all views.
 
-    Both designs are blurred. The first design is seen in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`.
-    The second design, or its mirror image, is seen in the attitude that matches best, with the best positive gain and
-    offset. Each comparison is made with every fraction of the patch's radius in :data:`PARTS_OF_IDENTITY` inside the
-    window. The most similar case counts. Each pair is compared in both orders, so both results are symmetric.
+    Both designs are blurred. The first design is seen in every tilt of :data:`~kpbench.analysis.cell_images.TILTS_DEG`,
+    without rotation in the plane. The second design and its mirror image are seen in every attitude. A positive gain
+    and an offset fit the second image to the first image. The window shows each fraction of the patch's radius in
+    :data:`PARTS_OF_IDENTITY` in turn. Each pair is compared in both orders, so both results are symmetric.
 
     Parameters
     ----------
@@ -111,7 +111,8 @@ def _distance_over_turns(grid: PolarGrid, inks: Float32, others: Float32, turns:
 def symmetry_order(patch: Patch) -> int:
     """Return the number of rotations within a full turn that leave the print unchanged.
 
-    1 means that the orientation is unique. 0 means that every rotation leaves the print unchanged.
+    The rotation by 0 degrees counts, so 1 means that the orientation is unique. 0 means that every rotation leaves the
+    print unchanged.
 
     Examples
     --------

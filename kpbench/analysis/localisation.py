@@ -1,4 +1,4 @@
-"""Localisation: how exactly the image of a design determines its centre."""
+"""Localisation: how exactly the image of a design determines the design's centre."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SHIFT_DIRECTIONS = 8
 
 @dataclass(frozen=True)
 class Bound:
-    """Cramér-Rao bound of the centre of a design, for the worst direction of the tilt.
+    """Cramér-Rao bound on the image position of a design's centre, for the worst direction of the tilt.
 
     Attributes
     ----------
@@ -62,12 +62,13 @@ class Bound:
 def point_bound(
     cells: Sequence[Float], inks: Float32, attitude: Float, blur_px: float = 0.0, rim: bool = True
 ) -> tuple[Float, Float]:
-    """Return the Cramér-Rao bound of the image point of the cells' origin, at :data:`NOISE` and :data:`CONTRAST`.
+    """Return the Cramér-Rao bound on the image position of the origin of the cells' frame.
 
-    The 8 unknowns are the point (2), the affine deformation (4) and both inks (2). Derivatives are central differences
-    of exact images. With Gaussian noise, the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided
-    by the standard deviation of the noise (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*,
-    1993, eq. 3.31). The cells are surrounded by a known mid-grey.
+    The 8 unknowns are the position (2), the linear part of the affine map (4) and the grey levels of both inks (2). The
+    derivatives of the image with respect to the unknowns are central differences of exact images. With Gaussian noise,
+    the Fisher information is ``F = J Jᵀ``, where J holds the derivatives divided by the standard deviation of the noise
+    (S. Kay, *Fundamentals of Statistical Signal Processing: Estimation Theory*, 1993, eq. 3.31). The contrast is
+    :data:`CONTRAST`, the noise is :data:`NOISE`, and the surroundings of the cells are a known mid-grey.
 
     Parameters
     ----------
@@ -80,13 +81,13 @@ def point_bound(
     blur_px : float
         Standard deviation of a Gaussian blur.
     rim : bool
-        Whether pixels that lie partly outside the cells count. False stands for an unknown background.
+        Whether to use pixels that lie partly outside the cells. False suits an unknown background.
 
     Returns
     -------
     worst_px, rms_px : ndarray of shape (n,)
-        Standard deviation of the point in the worst direction, and root mean square of its standard deviations along x
-        and y. Both are infinite if the image does not determine the point.
+        Standard deviation of the position in the worst direction, and root mean square of the standard deviations along
+        x and y. Both are infinite if the image does not determine the position.
 
     Examples
     --------
@@ -123,7 +124,7 @@ def point_bound(
     J = np.concatenate([geometric, black[:, :1], whole[:1] - black[:, :1]], axis=1) * (CONTRAST / NOISE)
     F = J @ J.transpose(0, 2, 1)
     nuisance = np.linalg.pinv(F[:, 2:, 2:], rcond=1e-7, hermitian=True)
-    # Schur complement: the information on the point when the other six unknowns are estimated too
+    # Schur complement: the information on the position when the other six unknowns are estimated too
     centre = F[:, :2, :2] - F[:, :2, 2:] @ nuisance @ F[:, 2:, :2]
     information = np.linalg.eigvalsh(centre)
     known = information > 1e-5 * F[:, :2, :2].trace(axis1=1, axis2=2)[:, None]
@@ -173,12 +174,12 @@ def design_bound(
 
 
 def basin(grid: PolarGrid, inks: Float32) -> Float:
-    """Return how much each design differs from itself at a small shift.
+    """Return the smallest difference between each design and a shifted copy of the design.
 
-    A blurred patch is compared with itself, shifted by :data:`SHIFT` of the window's radius. The comparison is made for
-    eight directions of the shift, for every attitude of the shifted patch, and with every fraction of the patch's
-    radius in :data:`PARTS_OF_BASIN` inside the window. The difference is a root mean square after the best gain and
-    offset, in units of the ink contrast. The smallest difference is returned.
+    The design is seen in a frontal view. The copy is shifted by :data:`SHIFT` window radii in each of eight directions,
+    and is seen in every attitude. Both are blurred. A gain and an offset fit the image of the copy to the image of the
+    design. The window shows each fraction of the patch's radius in :data:`PARTS_OF_BASIN` in turn. A difference is a
+    root mean square, divided by the ink contrast.
 
     Parameters
     ----------

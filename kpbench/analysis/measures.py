@@ -39,7 +39,7 @@ class DesignMeasures:
     centre_is_crossing : bool
         See :attr:`kpbench.Patch.centre_is_crossing`.
     symmetry_order : int
-        Number of rotations that leave the print unchanged; 0 if every rotation does.
+        See :func:`kpbench.analysis.symmetry_order`.
     turned_distance, mirrored_distance : float
         Smallest distances from the design to itself rotated by 45 to 315 degrees, and to its mirror image, in ink
         contrasts.
@@ -49,17 +49,17 @@ class DesignMeasures:
     black_fraction : float
         Black share of the design's area.
     pixels_needed : float
-        Radius of the disc in px at which the smallest region holds a circle of 2 px diameter.
+        Smallest disc radius in px at which a circle of 2 px diameter fits into every region of one ink.
     bounds : tuple of Bound
-        One bound for each combination of size, tilt and blur.
+        One bound for each combination of disc radius, tilt and blur.
     bound_without_rim_px : float
         Bound in the worst direction, for a frontal view at 5 px radius on an unknown background. Infinite if the inside
         of the patch alone does not determine the centre.
     basin : float
         Difference between the design and its shifted copy, in ink contrasts, see :func:`kpbench.analysis.basin`.
     natural_response, natural_response_blurred : tuple of float
-        Share of the places in images with a correlation above 0.8 with the design, and share with a correlation above
-        0.9. The second tuple is for blurred designs and images.
+        Share of image windows whose correlation with the design is above 0.8, and share above 0.9. For the second
+        tuple, the design and the windows are blurred.
 
     Examples
     --------
@@ -90,7 +90,7 @@ class DesignMeasures:
         return sorted({bound.radius_px for bound in self.bounds})
 
     def bound_at(self, radius_px: float, tilt_deg: float = 0.0, blur: float = 0.0) -> Bound:
-        """Return the element of ``bounds`` with this size, tilt and blur."""
+        """Return the element of ``bounds`` with this disc radius, tilt and blur."""
         wanted = (radius_px, tilt_deg, blur)
         return next(b for b in self.bounds if (b.radius_px, b.tilt_deg, b.blur) == wanted)
 
@@ -205,7 +205,7 @@ def measure_designs(
 
 
 def pixels_needed(grid: PolarGrid, inks: Float32, samples: int = 128) -> Float:
-    """Return the disc radius in px at which the smallest region of one ink holds a circle of 2 px diameter.
+    """Return the smallest disc radius in px at which a circle of 2 px diameter fits into every region of one ink.
 
     Parameters
     ----------

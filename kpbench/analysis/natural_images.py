@@ -22,7 +22,7 @@ from kpbench.analysis.cell_images import (
 from kpbench.render.background import PhotoFolder, procedural_background
 from kpbench.types import Float, Float32, UInt8
 
-LOOKS_ALIKE = (0.8, 0.9)  # a place looks like a design if its correlation is above these thresholds
+LOOKS_ALIKE = (0.8, 0.9)  # two thresholds of the correlation above which a place looks like a design
 LEAST_SPREAD = 8.0  # grey levels; a window with a smaller standard deviation looks like no design
 WINDOWS = 20_000
 WINDOWS_PER_IMAGE = 200
@@ -78,7 +78,7 @@ def _photographs(folder: PhotoFolder, rng: np.random.Generator) -> Iterator[UInt
 
 
 def sample_windows(photographs: Iterable[UInt8], rng: np.random.Generator, count: int = WINDOWS) -> UInt8:
-    """Return windows at random places of images, each image at full, half or quarter size.
+    """Return windows at random places of images. Each image has full, half or quarter size, chosen at random.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def natural_response(grid: PolarGrid, inks: Float32, windows: UInt8, blur: float
     Returns
     -------
     ndarray of shape (n, 2), float64
-        Share of the windows with a correlation above 0.8, and share with a correlation above 0.9. A window with a
+        Share of the windows whose correlation with the design is above 0.8, and share above 0.9. A window with a
         standard deviation under 8 grey levels never looks like a design.
 
     Examples

@@ -3,13 +3,13 @@
 A design is kept if
 
 * its centre is a crossing of straight edges,
-* its smallest region holds a circle of 2 px diameter at a disc radius of 4 px,
+* a circle of 2 px diameter fits into every region of one ink at a disc radius of 4 px,
 * its basin is at least 0.10 (a single corner has a basin of 0.041),
-* its bound without the rim is at most 0.05 px at 5 px radius,
-* at most one in 500 places of natural images looks like the design.
+* its Cramér-Rao bound without the rim's pixels is at most 0.05 px at a disc radius of 5 px,
+* at most one in 500 windows of natural images looks like the design (a correlation above 0.8).
 
 Of all sets of four designs, the best set is the set whose closest two designs are farthest apart. If several sets tie,
-their next closest pairs decide.
+the next closest pairs of the sets decide.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from kpbench.types import Float, Float32, UInt8
 MOST_PIXELS_NEEDED = 4.0  # px, radius of the disc
 LEAST_BASIN = 0.10  # ink contrasts
 MOST_BOUND_PX = 0.05  # at 5 px radius, without the rim
-MOST_NATURAL = 1 / 500  # share of places with a correlation over 0.8
+MOST_NATURAL = 1 / 500  # share of windows with a correlation above 0.8
 SET_SIZE = 4
 SEARCH_STEPS = 6 + IDENTITY_STEPS
 """Number of steps that :func:`search_designs` reports."""
@@ -102,7 +102,7 @@ class SearchResult:
     Attributes
     ----------
     counts : dict of str to int
-        Number of designs that remain after each step of the rule, in order.
+        Number of designs that remain after each step, by name of the step, in order.
     median_bound_px, median_basin, median_pixels_needed : float
         Medians over all designs of the family whose centre is a crossing. The bound is for a frontal view at 5 px
         radius.
@@ -155,7 +155,7 @@ def search_designs(
     windows : ndarray of shape (N, side, side), uint8
         From :func:`kpbench.analysis.background_windows`.
     known : tuple of Patch
-        Designs that keep their names and ids in the result. Other designs are named by their code.
+        Designs that keep their names and IDs in the result. The name of any other design is its code.
     count : int
         Largest number of sets that are returned.
     progress : callable

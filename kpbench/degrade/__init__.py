@@ -1,6 +1,6 @@
 """Degrade images: the effects, the ladder of their levels, and the user's own files.
 
-No effect depends on the designs. An effect that aims at patches takes discs: x, y and radius in px.
+No effect depends on the designs. An effect that aims at patches takes the discs of the patches: x, y and radius in px.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
 """Blurs: box, Gaussian, motion and defocus, each with its kernel.
 
-The functions keep the rules of :mod:`kpbench.degrade.effects`: no kernel moves the image.
+As :mod:`kpbench.degrade.effects` requires, no kernel moves the image.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
 
 @lru_cache(maxsize=2048)  # holds all kernels of the paper's mix; the ladder's kernels rarely repeat
 def line_kernel(length_px: float, angle_deg: float) -> Float:
-    """Rasterise a line, one pixel wide, through the kernel's centre, by exact area coverage; the sum is 1."""
+    """Return the exact area coverage of a line, one pixel wide, through the kernel's centre, scaled to the sum 1."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     half_length, half_width = length_px / 2, 0.5
     corners = np.array([
@@ -155,7 +155,7 @@ def defocus(image: UInt8, radius_px: float) -> UInt8:
 
 @lru_cache(maxsize=64)
 def disc_kernel(radius_px: float) -> Float:
-    """Rasterise a disc about the kernel's centre by exact area coverage; the sum is 1."""
+    """Return the exact area coverage of a disc about the kernel's centre, scaled to the sum 1."""
     step = 2 * np.pi / 256
     rim = arc_vertices(radius_px, np.arange(256) * step, step)
     reach = int(np.ceil(radius_px)) + 1

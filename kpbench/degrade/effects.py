@@ -254,9 +254,9 @@ def low_light(
 ) -> UInt8:
     """Simulate the image under less light, brightened to its former brightness.
 
-    The camera is linear (EMVA Standard 1288). At full light, grey level 255 is a full well. The simulated exposure has
-    ``2 ** -stops`` of the light. The number of electrons is Poisson-distributed, and reading adds Gaussian noise. An
-    analogue gain up to ``most_gain`` makes up for the missing light. The converter rounds. A digital factor makes up
+    The camera is linear (EMVA Standard 1288). At full light, a full well gives grey level 255. The simulated exposure
+    has ``2 ** -stops`` of the light. The number of electrons is Poisson-distributed, and reading adds Gaussian noise.
+    An analogue gain up to ``most_gain`` makes up for the missing light. The converter rounds. A digital factor makes up
     for the light that is still missing.
 
     Parameters
@@ -349,7 +349,7 @@ def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
 
 
 def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) -> UInt8:
-    """Add the glow of a lamp in the lens, and three ghosts on the line through the lamp and the image's centre.
+    """Add the glow of a lamp, and three ghosts (lens reflections) on the line through the lamp and the image's centre.
 
     Parameters
     ----------
@@ -357,7 +357,7 @@ def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) ->
     x, y : float
         Place of the lamp, px.
     strength : float
-        Glow at the lamp, grey levels. At a distance the glow is ``strength * exp(-distance / reach_px)``.
+        Glow at the lamp, grey levels. At a distance in px, the glow is ``strength * exp(-distance / reach_px)``.
     reach_px : float
         Distance at which the glow has fallen to 1/e, px.
 

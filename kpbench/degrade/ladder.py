@@ -141,7 +141,7 @@ LADDER: dict[str, Severity] = {
 def draw_effect(
     rng: np.random.Generator, effect: str, level: float, size_px: tuple[int, int], discs: Discs | None = None
 ) -> Effect:
-    """Draw the parameters that a level leaves open, such as an angle or a place.
+    """Return the record of an effect at a level. Parameters that the level leaves open, such as an angle, are drawn.
 
     Parameters
     ----------
@@ -149,7 +149,7 @@ def draw_effect(
     effect : str
         A key of :data:`LADDER`.
     level : float
-        Any number within the effect's bounds, in the effect's unit. The number need not be a rung.
+        Any number within the effect's bounds, in the effect's unit. The number need not be a standard level.
     size_px : (int, int)
         Width and height of the image.
     discs : ndarray of shape (n, 3), optional
@@ -227,7 +227,7 @@ LADDER_MIX = (
 
 
 def draw_ladder_mix(rng: np.random.Generator, size_px: tuple[int, int], discs: Discs | None = None) -> list[Effect]:
-    """Draw one or two effects of the ladder, at uniform levels between no effect and the severest rung.
+    """Draw one or two effects of the ladder. The levels are uniform between no effect and the severest standard level.
 
     Parameters
     ----------

@@ -61,7 +61,7 @@ def degrade_files(
     out : str or Path
         Folder, made if missing. The folder must not be the folder of the images.
     steps : sequence of (str, float)
-        Effect and level of :data:`kpbench.degrade.LADDER`, applied in order.
+        Effects, as keys of :data:`kpbench.degrade.LADDER`, each with a level. The effects are applied in order.
     seed : int
 
     Yields

@@ -16,7 +16,7 @@ from kpbench.types import UInt8
 def import_albumentations() -> Any:
     """Import albumentations and return the module.
 
-    The import is slow and is therefore made at the first use. The environment variable stops albumentations from
+    The import is slow and is therefore made at the first use. ``NO_ALBUMENTATIONS_UPDATE`` stops albumentations from
     looking online for a newer version.
     """
     os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"

@@ -31,8 +31,8 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 class Camera:
     """A camera whose principal point is the centre of the image.
 
-    A point (X, Y, Z) of the camera frame has the ray (x, y) = (X / Z, Y / Z). :meth:`distort` applies the model of
-    Brown (1966) in OpenCV's form to the ray, with ``r² = x² + y²``::
+    A point (X, Y, Z) of the camera frame has the ray (x, y) = (X / Z, Y / Z). :meth:`distort` first applies the
+    model of Brown (1966) in OpenCV's form to the ray, with ``r² = x² + y²``::
 
         x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
         y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)

@@ -2,10 +2,10 @@
 
 Each pixel gets the area of the polygon within the pixel, without sampling. The algorithm:
 
-1. Cut every edge into pieces at the pixel borders.
-2. For each piece, add the signed area between the piece and the right border of its pixel to this pixel. Add the rest
-   of the signed height of the piece to the pixel on the right.
-3. Sum along the rows. The sum carries the height of each piece to all pixels right of the piece.
+1. Cut every edge into pieces at the pixel borders. A piece has a signed height h, the difference of its y coordinates,
+   and a signed area a, the area between the piece and the right border of the pixel.
+2. For each piece, add a to the pixel of the piece, and add h - a to the next pixel on the right.
+3. Compute the running sum of every row. A piece then adds a to its own pixel, and h to all pixels on the right.
 
 The cost of steps 1 and 2 grows with the length of the outline, not with the area inside.
 """
@@ -142,7 +142,7 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
 
 
 def clip_to_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:
-    """Return the slices into the image and the slices into a box for the part of the box inside the image."""
+    """Return two pairs of slices that cut the overlap of a box and an image out of the image and out of the box."""
     x, y, w, h = box
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, image.shape[1]), min(y + h, image.shape[0])
     x1, y1 = max(x0, x1), max(y0, y1)

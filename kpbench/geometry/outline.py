@@ -202,7 +202,7 @@ def _vertices(part: Line | Arc, tolerance: float) -> Float:
     """Return the vertices of one segment without its last point, which is the first point of the next segment."""
     if isinstance(part, Line):
         return np.array([[part.x0, part.y0]])
-    # the chords over an angle 2h are up to about r h² / 3 off the arc: at the vertices, which lie outside the arc
+    # chords over an angle 2h deviate most from the arc at the vertices, which lie about r h² / 3 outside the arc
     half = np.sqrt(4 * tolerance / part.radius) if tolerance < part.radius else np.pi / 4
     count = max(2, int(np.ceil(abs(np.radians(part.sweep_deg)) / (2 * half))))
     step = np.radians(part.sweep_deg) / count

@@ -1,4 +1,4 @@
-"""Rulers, lines of text, cut marks and registration crosses, in the page frame before any mirroring."""
+"""Rulers, lines of text, cut marks and registration crosses, in the page frame of a page that is not mirrored."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from kpbench.geometry.outline import Arc, Line, Region
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
 PRINT_MARK = "kpbench.print/1"
-"""Mark in the file of a print. :func:`kpbench.writing.write_file` may replace a print by a print."""
+"""Mark in every file of a print. :func:`kpbench.writing.write_file` replaces an earlier print, which has this mark."""
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ class PageFormat:
         return x, y
 
     def position_on_paper(self, x: float, y: float) -> tuple[float, float]:
-        """Return the position on the paper, in mm rounded to 1 nm. A mirrored page mirrors the point of the layout."""
+        """Return where a point of the layout lies on the paper, in mm rounded to 1 nm. A mirrored page mirrors x."""
         return round_to_nm(self.width_mm - x if self.mirrored else x), round_to_nm(y)
 
     def make_page(self, shapes: Iterable[Shape], texts: Iterable[Text], title: str) -> Page:

@@ -17,7 +17,7 @@ MAX_PIXELS = 1_000_000_000
 
 
 def px_per_mm(dpi: float) -> float:
-    """Return the pixels per mm of a PNG, rounded to whole pixels per metre: PNG stores whole pixels per metre.
+    """Return the pixels per mm of a PNG. PNG stores whole pixels per metre, so the value is rounded to 0.001.
 
     Examples
     --------

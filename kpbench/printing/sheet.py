@@ -130,8 +130,8 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
     Raises
     ------
     DesignError
-        If the board does not fit the page and ``tile`` is false. The message names the largest diameter that fits. If
-        ``tile`` is true and no straight seam passes between the patches.
+        If the board does not fit the page, and ``tile`` is false or no straight seam passes between the patches. If
+        ``tile`` is false, the message names the largest diameter that fits.
 
     Examples
     --------

@@ -75,8 +75,8 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     Raises
     ------
     DesignError
-        If the folder holds no sidecar, a sidecar is incomplete, or a measured length differs from the ruler's
-        nominal length by more than 10 %.
+        If the folder holds no sidecar, a sidecar is incomplete, a file cannot be read, or a measured length differs
+        from the ruler's nominal length by more than 10 %.
 
     Examples
     --------

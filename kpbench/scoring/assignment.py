@@ -1,8 +1,8 @@
 """Match detections to true keypoints one to one, in all images at once.
 
 The best one-to-one assignment has the most matches, then the highest scores, then the smallest sum of distances. If
-several assignments are equally good, x decides, then y. Identities do not influence the matches. The order of images,
-keypoints and detections does not influence the matches.
+several assignments are equally good, the x coordinates decide, then the y coordinates. Identities do not influence the
+matches. The order of images, keypoints and detections does not influence the matches.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Matches:
         Distance to the matched detection, px; nan without a match.
     contradicted : ndarray of shape (T,), bool
         Whether a second detection has the place and the score of the matched detection, but another identity.
-        Neither identity is then correct, because the order of the detections must not decide between the two.
+        Neither identity then counts as correct, because the order of the detections must not decide between the two.
     nearest : ndarray of shape (D,), int64
         Row of the nearest true keypoint within the matching threshold; -1 without such a keypoint.
     kind : ndarray of shape (D,), uint8
@@ -190,7 +190,7 @@ def _choose_matches(
 
 
 def _find_nearest(pairs: _Pairs, truth: TruthPoints, found: DetectionPoints) -> Int:
-    """Return :attr:`Matches.nearest`. Of several nearest keypoints, take the one of smallest x, then smallest y."""
+    """Return :attr:`Matches.nearest`. The smallest x, then the smallest y breaks ties."""
     shared = np.bincount(pairs.d, minlength=len(found.xy))[pairs.d] > 1
     nearest = np.full(len(found.xy), -1)
     nearest[pairs.d[~shared]] = pairs.t[~shared]
@@ -290,7 +290,7 @@ def _assign_component(a: Int, b: Int, distance: Float, score: Float) -> Int:
 
     The sets of detections that can be matched together form a transversal matroid. So for any positive weights that
     rise with the score, the assignment of the largest total weight has the most matches and the highest scores. The
-    weight of a pair is the rank of the score, a whole number, minus a fraction that rises with the distance. The
+    weight of a pair is the rank of the score, a whole number, minus a fraction proportional to the distance. The
     fractions of an assignment add up to less than 1, so distances decide only between assignments of equal scores.
     """
     if not len(a):

@@ -27,11 +27,11 @@ from scipy.special import ndtr, ndtri, stdtrit
 from kpbench.types import Float, Int
 
 TAIL = 0.025
-"""Nominal probability that the true value lies below a 95 % interval. The probability above is the same."""
+"""Nominal probability that the true value lies below a 95 % interval, and that it lies above the interval."""
 Interval = tuple[float, float]
 """Lower and upper bound."""
 MOST_KINDS = 1000
-"""Largest number of kinds to draw from. Scenes of equal counts are one kind. More kinds are pooled at random."""
+"""Largest number of kinds. A kind is a group of scenes of equal counts. Random pools of scenes replace more kinds."""
 
 
 def sum_by_scene(sums: NDArray[Any], scene: Int) -> NDArray[Any]:
@@ -91,7 +91,7 @@ def bootstrap_intervals(
         return dict.fromkeys(statistics(sums.sum(axis=0)))
     kinds, count = _unique_rows(sums)
     rng = np.random.default_rng(seed)
-    if len(kinds) > MOST_KINDS:  # random pools of about equal size: sums of pools vary like sums of scenes
+    if len(kinds) > MOST_KINDS:  # sums of random pools of about equal size vary like sums of scenes
         shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
         kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
         count = np.ones(MOST_KINDS, np.int64)

@@ -32,9 +32,9 @@ class Breakpoint:
     rung : float or None
         Rung of the first crossing of this kind, interpolated linearly; None for "over" and "under".
     interval : (low, high) or None
-        95 % interval of the rung from resampled scenes. A resample that does not cross the limit in this direction
-        counts as a crossing at the first or the last rung. None for "over" and "under", for fewer than two scenes, and
-        if `resamples` is 0.
+        95 % interval of the rung from resampled scenes. A resample without such a crossing counts as a crossing at the
+        first rung if the score there is already past the limit, else at the last rung. None for "over" and "under", for
+        fewer than two scenes, and if `resamples` is 0.
 
     Examples
     --------
@@ -107,7 +107,7 @@ def _find_in_condition(scores: Scores, name: str, rungs: list[float], limit: flo
 def _sums_by_rung(scores: Scores, condition: str, rungs: list[float]) -> Int:
     """Return the counts of each scene of a condition, of shape (C, 2R).
 
-    The first two columns count the true keypoints and the matches at the first rung. Further rungs follow, in order.
+    Each rung has two columns, in order: the number of true keypoints and the number of matches.
     """
     truth, sums = scores.outcomes.truth, scores.outcomes.image_sums
     images = np.flatnonzero(truth.condition == condition)

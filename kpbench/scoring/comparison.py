@@ -95,7 +95,7 @@ class Comparison:
     differences: tuple[Difference, ...]
 
     def verdicts(self, metric: str) -> dict[str, int]:
-        """Count the verdicts on the first detector in each rung, or over all images if the images have no rungs."""
+        """Count the rungs by verdict on the first detector. Without rungs, count the verdict over all images."""
         overall, *of_rungs = (d.verdict for d in self.differences if d.metric == metric)
         found = of_rungs or [overall]
         return {verdict: found.count(verdict) for verdict in ("better", "even", "worse")}

@@ -29,7 +29,7 @@ _NEED_DETECTIONS = {
     *("average_false_alarm", "average_false_alarm_literal", "precision", "f1", "average_precision"),
     *("detections", "duplicate", "near_miss", "clutter"),
 }
-"""Metrics and counts that are undefined if the false alarms of an image belong to no single group."""
+"""Metrics and counts that are undefined if the false alarms of an image cannot be divided between groups."""
 _NEED_IDS = {"id_matching_score", "id_matching_score_literal", "id_correct", "wrong_id", "id_correct_literal"}
 """Metrics and counts that are undefined for a detector without identities."""
 
@@ -125,8 +125,8 @@ class _Units(NamedTuple):
     """Whether the unit's image has several units, of shape (M,). The image's detections then belong to no unit."""
 
     def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
-        """Compute a group for each key. ``label`` (M,) holds the index in ``keys`` of each unit."""
-        label_or_none = np.append(label, -1)  # the unit -1 indexes the appended label -1
+        """Compute a group for each key. ``label`` (M,) holds each unit's index into ``keys``."""
+        label_or_none = np.append(label, -1)  # a detection of unit -1 gets the last label, -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
         labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
         rows = [_rows_of_labels(part, len(keys)) for part in labels]
@@ -167,14 +167,15 @@ class _Units(NamedTuple):
 
 
 def make_groups(outcomes: Outcomes) -> Iterator[Group]:
-    """Compute all groups of a score.
+    """Compute all groups of the matched predictions.
 
     Yields
     ------
     Group
         First a group of all images. Then a group for each condition and rung; for each patch within each condition and
-        rung; for each patch over all images; and for each bin of radii over all images. Groups for patches need several
-        patches. Groups for bins need several bins. Images without condition and rung form no group of their own.
+        rung; for each patch over all images; and for each bin of radii over all images. Groups
+        for patches are made only if the truth has several patches, and groups for bins only if radii fall into several
+        bins. Images without condition and rung form no group of their own.
     """
     truth, n = outcomes.truth, len(outcomes.truth)
     image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image

@@ -36,7 +36,7 @@ RATIOS = (
     "recall",
     "f1",
 )
-"""Names of the metrics that are ratios of sums. Only these have intervals."""
+"""Names of the metrics that are ratios of sums. Only these metrics have intervals."""
 
 METRICS = (
     *RATIOS,

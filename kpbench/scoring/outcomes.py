@@ -66,8 +66,8 @@ class Settings:
 class Outcomes:
     """The outcome of each of T true keypoints and D detections in N images.
 
-    Rows keep the order of the truth and of the predictions. The rows of an image are then contiguous in memory, which
-    millions of images need for speed.
+    Rows keep the order of the truth and of the predictions. The rows of each image are therefore contiguous
+    in memory, which makes the scoring of millions of images fast.
 
     Attributes
     ----------
@@ -194,7 +194,7 @@ def match_predictions(
     image = find_images(truth, predictions, allow_missing)
     points = _read_points(truth, settings.eps_radius)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
-    # Without detections, missing IDs do not prove a detector without identities: keep the ID metrics defined
+    # Predictions without detections hold no IDs, but the detector may know IDs: keep the ID counts defined
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
     detections = DetectionPoints(predictions.xy, predictions.score, image, ids)
     matches = match(points, detections, settings.eps)

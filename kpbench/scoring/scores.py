@@ -5,11 +5,11 @@ Conventions
 A detection can match a true keypoint if their distance is **at most** the matching threshold: ε times the radius of
 *that* keypoint's projected circle (:class:`kpbench.scoring.Settings`). One detection is matched to one keypoint. The
 best one-to-one assignment has the most matches, then the highest scores, then the smallest sum of distances. If several
-assignments are equally good, x decides, then y. Identities do not influence the matches. The order of images, keypoints
-and detections does not influence the matches.
+assignments are equally good, the x coordinates decide, then the y coordinates. Identities do not influence the matches.
+The order of images, keypoints and detections does not influence the matches.
 
 Each step has a module. ``assignment`` finds the matches, and ``outcomes`` judges each keypoint and detection.
-``metrics`` and ``bootstrap`` compute metrics and intervals, and ``groups`` does so for groups of images and keypoints.
+``metrics`` computes metrics, ``bootstrap`` computes intervals, and ``groups`` computes both for each group.
 This module puts the scores together. ``docs/reference/metrics.md`` describes each metric with its edge cases.
 """
 

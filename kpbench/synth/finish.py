@@ -28,7 +28,7 @@ def degrade_scene(scene: Rendering, rng: np.random.Generator, effects: Sequence[
     Parameters
     ----------
     scene : Rendering
-        Not changed.
+        Stays unchanged.
     rng : numpy.random.Generator
         See :func:`kpbench.degrade.apply_effects`.
     effects : sequence of dict
@@ -37,8 +37,8 @@ def degrade_scene(scene: Rendering, rng: np.random.Generator, effects: Sequence[
     Returns
     -------
     Rendering
-        The poses are unchanged, because no effect moves the image. Occlusions lower ``visible``; ``contrast`` is
-        measured in the degraded image.
+        The poses are unchanged, because no effect moves the image. Occlusions lower ``visible``. The
+        values of ``contrast`` are measured in the degraded image.
     """
     image, keypoints = apply_effects(scene.image, rng, effects), scene.keypoints.copy()
     keypoints["visible"] *= unoccluded_fraction(image, effects, scene.masks)
@@ -54,7 +54,7 @@ def augment_scene(
     Parameters
     ----------
     scene : Rendering
-        Not changed.
+        Stays unchanged.
     placements : sequence of Placement
         The patches of the scene.
     effects : sequence of dict

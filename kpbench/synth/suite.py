@@ -39,7 +39,7 @@ BOARD_SIDE_MM = 187.5
 
 @dataclass(frozen=True)
 class View:
-    """Everything that one image of a suite shows, except the background. Nothing is painted yet.
+    """Everything that one image of a suite shows, except the background, before anything is painted.
 
     Attributes
     ----------
@@ -75,7 +75,7 @@ class View:
 
 @dataclass(frozen=True)
 class SuiteConfig:
-    """Configuration of a suite's images: with the background files, it determines every image.
+    """Configuration of a suite. The configuration and the background files determine every image.
 
     Attributes
     ----------
@@ -165,7 +165,7 @@ class SuiteConfig:
 
     @cached_property
     def boards(self) -> tuple[BoardLike, ...]:
-        """The boards that every scene shows under every rung."""
+        """The boards. Every base scene is shown with each board under every rung."""
         if self.board is not None:
             return (tag_board(self.board, BOARD_SIDE_MM),)
         return tuple(hexagon_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
@@ -228,7 +228,7 @@ class SuiteConfig:
         return index % self.scenes
 
     def view(self, index: int) -> View:
-        """Draw pose, light and effects of one image and compute its truth; nothing is painted.
+        """Draw pose, inks, light and effects of one image, and compute the truth. Nothing is painted.
 
         Parameters
         ----------

@@ -35,7 +35,7 @@ DETERIORATIONS = ("none", "paper", "ladder")
 
 @dataclass(frozen=True)
 class SynthConfig:
-    """Configuration of a synthetic set: with the background files, it determines every image.
+    """Configuration of a synthetic set. The configuration and the background files determine every image.
 
     Attributes
     ----------
@@ -143,7 +143,7 @@ class SynthConfig:
 
     @property
     def image_bytes(self) -> int:
-        """Expected size of one image on disk: photographs shrink to about two thirds, noise hardly shrinks."""
+        """Expected size of one image on disk. PNG shrinks photographs to about two thirds and hardly shrinks noise."""
         width, height = self.size_px
         return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
 

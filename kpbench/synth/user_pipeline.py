@@ -27,7 +27,7 @@ from kpbench.render.placement import Placement
 from kpbench.types import UInt8
 
 LEAST_IMAGE_SHARE = 0.999
-"""Least fraction of a pixel that must come from the original image; the transform fills the rest of the pixel."""
+"""A homography is fitted only to pixels of which more than this fraction comes from the original image."""
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
@@ -146,13 +146,13 @@ def _pixel_coordinates(height: int, width: int) -> NDArray[np.float32]:
 
 
 def _move_placement(placement: Placement, source_px: NDArray[np.float32]) -> Placement | None:
-    """Move a patch with the pixels of its image.
+    """Return a patch at the pose to which the pipeline has moved the patch's pixels.
 
     Parameters
     ----------
     placement : Placement
     source_px : ndarray of shape (H, W, 3), float32
-        :func:`_pixel_coordinates` after the move: the former position of each pixel's content.
+        :func:`_pixel_coordinates` after the pipeline: the former position of each pixel's content.
 
     Returns
     -------
