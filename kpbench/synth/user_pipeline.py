@@ -73,7 +73,11 @@ def load_augmentation(path: str | Path) -> str:
 def _parse_yaml(text: str) -> Any:
     import yaml  # type: ignore[import-untyped]  # albumentations requires yaml
 
-    return yaml.safe_load(text)
+    # A few lines of aliases of aliases stand for millions of values. albumentations.save writes no alias.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in Python needs seconds for some small files
+    if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, loader)):
+        raise ValueError("it has aliases (*name)")
+    return yaml.load(text, loader)
 
 
 @lru_cache(maxsize=4)
