@@ -13,6 +13,21 @@ A user of the library catches ``KpbenchError``. The command line prints the mess
 
 from __future__ import annotations
 
+LONGEST_MESSAGE = 800
+"""Characters. Of a longer message, the middle is left out."""
+
+
+def one_line(text: str) -> str:
+    """Return a text as one line of moderate length that a terminal and a log can show.
+
+    Names and values of files go into messages. They may hold line breaks, escape sequences, or halves of characters.
+    """
+    text = " ".join(text.splitlines()) if len(text.splitlines()) > 1 else text
+    if not text.isprintable():
+        text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    half = LONGEST_MESSAGE // 2
+    return text if len(text) <= LONGEST_MESSAGE else f"{text[:half]} … {text[-half:]}"
+
 
 class KpbenchError(Exception):
     """Base class of all errors that kpbench raises on purpose.
@@ -28,6 +43,9 @@ class KpbenchError(Exception):
     ...     print(error)
     mine.toml: cannot be read, No such file or directory
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(one_line(str(message)))
 
 
 class KpbenchWarning(UserWarning):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +13,9 @@ from typing import Any
 
 from kpbench.errors import KpbenchError
 from kpbench.files import read_text
+
+LARGEST = sys.float_info.max
+"""Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
 
 
 def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
@@ -158,6 +162,6 @@ class TomlTable:
         problem = f"{self.path(key)} is {'missing' if value is None else repr(value)}"
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise self.error(f"{problem}, expected a {'whole ' * whole}number {limits}")
-        if math.isinf(value) or (whole and value % 1):
+        if abs(value) > LARGEST or (whole and value % 1):
             raise self.error(f"{problem}, expected a {'whole' if whole else 'finite'} number {limits}")
         return int(value) if whole else float(value)

@@ -25,11 +25,16 @@ from kpbench.errors import DataError
 from kpbench.files import note_read
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
+from kpbench.toml import TomlTable, name_source
 from kpbench.types import Detections, Float, Float32, UInt8
 
 CELL_PX = 8
 """Side of a cell, px."""
 SCHEMA = "kpbench.superpoint/1"
+MOST_PEAKS = 10_000
+"""Largest number of maxima of an image that are looked at, the best first. A trained network has a few hundred."""
+MOST_DESIGNS = 256
+"""Largest number of designs of a network."""
 """Schema of the metadata in the ONNX file."""
 EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
 """A cell is empty if log(p / q) is at most this for every pixel, where p is the probability of the pixel and q the
@@ -125,7 +130,8 @@ def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
     rows, columns = np.divmod(found, probability.shape[1])
     windows = _windows(probability, rows[:, None] + offset, columns[:, None] + offset)
     total = windows.sum(axis=(1, 2))
-    likely = total >= decoding.threshold
+    likely = np.flatnonzero(total >= decoding.threshold)
+    likely = likely[np.argsort(-total[likely], kind="stable")[:MOST_PEAKS]] if len(likely) > MOST_PEAKS else likely
     rows, columns, windows, total = rows[likely], columns[likely], windows[likely], total[likely]
     x = columns + windows.sum(axis=1) @ offset / total
     y = rows + windows.sum(axis=2) @ offset / total
@@ -256,10 +262,17 @@ class SuperPointDetector:
             raise
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
             raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
-        if content.get("schema") != SCHEMA:
+        if not isinstance(content, dict) or content.get("schema") != SCHEMA:
             raise DataError(f"{self.path}: not written by kpbench export-model, expected schema {SCHEMA!r} inside")
         self.content: dict[str, Any] = content
-        self.name, self.version = str(content["name"]), f"{content['designs'][:8]}-{content['samples']}"
+        with name_source(self.path, DataError):
+            table = TomlTable(content, content.keys(), DataError)
+            self.name, self.version = (
+                table.text("name"),
+                f"{table.text('designs')[:8]}-{table.whole_number('samples', 0)}",
+            )
+            if len(table.entries("patches", "a list of designs")) > MOST_DESIGNS:
+                raise DataError(f"patches are {len(content['patches'])} designs, expected at most {MOST_DESIGNS}")
         self.version += "-int8" if "int8" in content else ""
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
         self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
@@ -296,7 +309,10 @@ class SuperPointDetector:
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         """Return the logits of the two heads, (B, 65, h, w) and (B, ids + 1, h, w), for B grey images of one size."""
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
-        return self._session.run(None, {"image": blob})
+        try:
+            return self._session.run(None, {"image": blob})
+        except Exception as error:  # as above
+            raise DataError(f"{self.path}: the network cannot be run ({_first_line(error)})") from None
 
     def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
         """Return the candidates of the network, for each of several grey images of one size.

@@ -18,6 +18,7 @@ from kpbench.errors import DesignError
 from kpbench.patches.design import Patch
 from kpbench.printing.page import round_to_nm
 from kpbench.printing.page_format import PageFormat
+from kpbench.toml import LARGEST, TomlTable, name_source
 from kpbench.writing import write_file
 
 BOARD_SCHEMA = "kpbench.board/1"
@@ -94,10 +95,12 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
             sidecar = json.loads(path.read_bytes())
             if not isinstance(sidecar, dict) or sidecar.get("schema") not in (BOARD_SCHEMA, SHEET_SCHEMA):
                 continue
-            content = json.dumps(correct_sidecar(sidecar, measured_mm, str(path)), indent=1) + "\n"
+            with name_source(path, DesignError):
+                corrected = correct_sidecar(sidecar, measured_mm)
+            content = json.dumps(corrected, indent=1, allow_nan=False) + "\n"
             written.append(path.with_suffix(".measured.json"))
             write_file(written[-1], content.encode())
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             raise DesignError(f"{path}: no complete sidecar ({type(error).__name__}: {error})") from None
         except OSError as error:
             raise DesignError(f"{error.filename}: {error.strerror}") from None
@@ -106,26 +109,27 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     return written
 
 
-def correct_sidecar(
-    sidecar: Mapping[str, Any], measured_mm: tuple[float, float], source: str = "sidecar"
-) -> dict[str, Any]:
+def correct_sidecar(sidecar: Mapping[str, Any], measured_mm: tuple[float, float]) -> dict[str, Any]:
     """Return the sidecar with lengths corrected to the real print. Positions on the page are not corrected.
 
     If the scales in x and y differ, a printed disc is an ellipse. The diameter in the sidecar is then the geometric
     mean of the two axes of the ellipse.
     """
+    TomlTable(sidecar, sidecar.keys(), DesignError).numbers("ruler_mm", 0, count=2)
     scale = [measured / nominal for measured, nominal in zip(measured_mm, sidecar["ruler_mm"], strict=True)]
     for axis, s, measured, nominal in zip("xy", scale, measured_mm, sidecar["ruler_mm"], strict=True):
         if not 1 - LARGEST_ERROR <= s <= 1 + LARGEST_ERROR:
             raise DesignError(
-                f"{source}: the {axis} ruler is {nominal:g} mm, but {measured:g} mm was measured; "
+                f"the {axis} ruler is {nominal:g} mm, but {measured:g} mm was measured; "
                 f"expected {0.9 * nominal:g} to {1.1 * nominal:g}"
             )
     x, y = scale
 
     def correct(entry: Mapping[str, Any]) -> dict[str, Any]:
         factor = {"x_mm": x, "y_mm": y, "diameter_mm": math.sqrt(x * y)}
-        return {key: round_to_nm(value * factor[key]) if key in factor else value for key, value in entry.items()}
+        table = TomlTable(entry, entry.keys(), DesignError)
+        lengths = {key: round_to_nm(table.number(key, -LARGEST) * factor[key]) for key in factor if key in entry}
+        return dict(entry) | lengths
 
     result = dict(sidecar) | {"print_scale": scale, "keypoints": [correct(k) for k in sidecar["keypoints"]]}
     if "side_mm" in sidecar:

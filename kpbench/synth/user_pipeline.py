@@ -31,6 +31,9 @@ LEAST_IMAGE_SHARE = 0.999
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
+LONGEST_VALUE = 1000
+"""Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
+
 
 def load_augmentation(path: str | Path) -> str:
     """Read a pipeline from a file that ``albumentations.save`` wrote.
@@ -73,7 +76,12 @@ def load_augmentation(path: str | Path) -> str:
 def _parse_yaml(text: str) -> Any:
     import yaml  # type: ignore[import-untyped]  # albumentations requires yaml
 
-    return yaml.safe_load(text)
+    # A few lines of aliases of aliases stand for millions of values. albumentations.save writes no alias.
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in Python needs seconds for some small files
+    for event in yaml.parse(text, loader):
+        if isinstance(event, yaml.AliasEvent) or len(getattr(event, "value", "")) > LONGEST_VALUE:
+            raise ValueError(f"it has an alias (*name), or a value of over {LONGEST_VALUE} characters")
+    return yaml.load(text, loader)
 
 
 @lru_cache(maxsize=4)

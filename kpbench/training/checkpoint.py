@@ -17,13 +17,16 @@ from torch import Tensor
 
 from kpbench import __version__
 from kpbench.errors import DataError
-from kpbench.patches.design import Patch
+from kpbench.patches.design import PATCH_KEYS, Patch
+from kpbench.toml import TomlTable, name_source
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe, parse_recipe
 from kpbench.writing import write_file
 
 SCHEMA = "kpbench.checkpoint/1"
-"""Name of the schema that a checkpoint's metadata follows."""
+CONTENT_KEYS = ("schema", "recipe", "step", "seconds", "patches", "designs", "versions")
+"""Keys of the metadata of a checkpoint."""
+"""Schema of the metadata in a checkpoint."""
 
 
 @dataclass
@@ -126,10 +129,18 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
         with safe_open(path, framework="pt") as file:
             content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error).splitlines()[0]})") from None
-    if content.get("schema") != SCHEMA:
+    except (OSError, SafetensorError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error) or type(error).__name__})") from None
+    if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: no checkpoint of kpbench train, expected schema {SCHEMA!r} inside")
+    with name_source(path, DataError):
+        table = TomlTable(content, CONTENT_KEYS, DataError)
+        table.whole_number("step", 0)
+        table.number("seconds", 0)
+        table.text("designs")
+        table.tables("patches", PATCH_KEYS)
+        table.table("versions", ("kpbench", "torch"))
+        load_mean_network(content, tensors)
     return content, tensors
 
 
@@ -167,7 +178,10 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
 
 
 def load_mean_network(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> SuperPoint:
-    """Return the network whose weights are the running mean in a checkpoint; the network is in evaluation mode."""
-    network = SuperPoint(parse_recipe(content["recipe"], "checkpoint").network)
-    network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
+    """Return a network, in evaluation mode, with the running mean of a checkpoint's weights."""
+    try:
+        network = SuperPoint(parse_recipe(content.get("recipe", {}), "recipe").network)
+        network.load_state_dict({k.removeprefix("mean."): v for k, v in tensors.items() if k.startswith("mean.")})
+    except (RuntimeError, TypeError, ValueError) as error:  # of PyTorch
+        raise DataError(f"the tensors do not fit the recipe ({error})") from None
     return network.eval()

@@ -13,6 +13,9 @@ from kpbench.files import shipped_folder
 from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.training.batches import SampleConfig
 
+MOST_CHANNELS, MOST_LAYERS, MOST_IDS = 4096, 64, 256
+"""Limits of a network, so that a damaged file cannot ask for all memory."""
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -54,6 +57,12 @@ class NetworkConfig:
         if len(self.widths) != 4 or len(self.depths) != 4 or min(*self.widths, *self.depths) < 1:
             raise DataError(
                 f"network: widths {self.widths} and depths {self.depths}, expected four positive numbers each"
+            )
+        channels, layers = max(*self.widths, self.head_width, self.descriptor_width), max(self.depths)
+        if channels > MOST_CHANNELS or layers > MOST_LAYERS or not 1 <= self.ids <= MOST_IDS:
+            raise DataError(
+                f"network: {channels} channels, {layers} layers in a stage and {self.ids} ids, expected at most "
+                f"{MOST_CHANNELS}, {MOST_LAYERS} and {MOST_IDS}"
             )
         if self.down not in ("max", "stride") or self.norm not in ("before", "after"):
             raise DataError(

@@ -6,7 +6,6 @@ If the initial weights belong to a smaller network, the smaller network grows (:
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
@@ -121,14 +120,13 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     DataError
         If the file cannot be read, or is no dict of named tensors.
     """
-    from safetensors import SafetensorError
     from safetensors.torch import load_file
 
     try:
         if Path(path).suffix == ".safetensors":
             return dict(load_file(path))
         loaded = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, SafetensorError, RuntimeError, EOFError, ValueError, KeyError, pickle.UnpicklingError) as error:
+    except Exception as error:  # PyTorch's unpickler raises anything on a damaged file
         why = (isinstance(error, OSError) and error.strerror) or "neither safetensors nor PyTorch's own"
         raise DataError(f"{path}: cannot be read as weights ({why})") from None
     if not isinstance(loaded, dict) or not all(
@@ -145,14 +143,18 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     try:
         model = onnx.load(path)
         content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
+        weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
+        if not isinstance(content, dict):
+            raise ValueError("its metadata are no JSON object")
+        recipe = parse_recipe(content["recipe"], str(path)) if "recipe" in content else None
     except Exception as error:  # protobuf raises errors of private classes
         why = (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
     if "int8" in content:
         raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
-    if content.get("recipe", {}).get("network", {}).get("norm") == "after":
+    if recipe is not None and recipe.network.norm == "after":
         raise DataError(f"{path}: its BatchNorm, after the activation, cannot be put back; start from its checkpoint")
-    return content, {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
+    return content, weights
 
 
 def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source: str) -> str:

@@ -43,11 +43,8 @@ def test_short_rulers_count_as_what_they_are():
 
 @pytest.mark.parametrize("measured", [(1.0, 100.0), (111.0, 100.0), (float("nan"), 100.0)])
 def test_a_length_that_cannot_be_is_refused(measured):
-    with pytest.raises(
-        DesignError, match=r"the x ruler is 100 mm, but .* mm was measured; expected 90 to 110"
-    ) as caught:
-        correct_sidecar(BOARD.sidecar, measured, "a.json")
-    assert str(caught.value).startswith("a.json: ")
+    with pytest.raises(DesignError, match=r"the x ruler is 100 mm, but .* mm was measured; expected 90 to 110"):
+        correct_sidecar(BOARD.sidecar, measured)
     with pytest.raises(DesignError, match="the y ruler"):
         correct_sidecar(BOARD.sidecar, measured[::-1])
 
@@ -72,5 +69,5 @@ def test_what_is_no_sidecar(tmp_path):
         correct_sidecars(tmp_path, (100, 100))
     for text in ("{", '{"schema": "kpbench.board/1"}', '{"schema": "kpbench.sheet/1", "ruler_mm": 3}'):
         (tmp_path / "broken.json").write_text(text)
-        with pytest.raises(DesignError, match=r"broken\.json: no complete sidecar"):
+        with pytest.raises(DesignError, match=r"broken\.json: (no complete sidecar|ruler_mm is)"):
             correct_sidecars(tmp_path, (100, 100))
