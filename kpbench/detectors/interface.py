@@ -167,6 +167,8 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
             "or program:COMMAND of your own"
         )
+    if name not in DETECTORS:
+        _search_current_folder()
     found = _import_attribute(DETECTORS.get(name, name))
     try:
         if isinstance(found, type):
@@ -211,11 +213,15 @@ def _set_threshold(detector: Any, threshold: float | None) -> Any:
     return detector
 
 
+def _search_current_folder() -> None:
+    """Let imports find modules in the current folder, after all other places, so that none of them is replaced."""
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+
+
 def _import_attribute(path: str) -> Any:
     """Return the object that ``MODULE:ATTR`` names."""
     module, _, attribute = path.partition(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
     try:
         return getattr(importlib.import_module(module), attribute)
     except ModuleNotFoundError as error:
