@@ -61,19 +61,18 @@ def escape_markdown(text: str) -> str:
 
     An underscore within a word stays: it marks nothing.
     """
-    return re.sub(r"[\\`*\[\]<>|~$&]|(?<!\w)_|_(?!\w)", r"\\\g<0>", escape_terminal(text))
-
-
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
-"""First characters of what spreadsheets take for a formula."""
+    return re.sub(r"[\\`*\[\]<>|~$]|&(?=[#\w])|(?<!\w)_|_(?!\w)", r"\\\g<0>", escape_terminal(text))
 
 
 def escape_csv(value: object) -> object:
-    """Return the value of a cell that no spreadsheet takes for a formula: a text like a formula begins with ``'``.
+    """Return the value of a cell that no spreadsheet takes for a formula, and no text of which ends the line.
 
-    Numbers stay as they are.
+    A text that begins with =, +, - or @ gets a ``'`` before it. Numbers stay as they are.
     """
-    return f"'{value}" if isinstance(value, str) and value[:1] in FORMULA_STARTS else value
+    if not isinstance(value, str):
+        return value
+    text = escape_terminal(value)
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
 
 
 def escape_csv_comment(text: str) -> str:

@@ -183,7 +183,9 @@ def write_card(dataset: Dataset, folder: Path) -> None:
         return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
     facts = "\n".join(f"| {key} | {escape_markdown(value)} |" for key, value in dataset_facts(dataset).items())
-    versions = ", ".join(escape_markdown(f"{name} {version}") for name, version in dataset.provenance.get("versions", {}).items())
+    versions = ", ".join(
+        escape_markdown(f"{name} {version}") for name, version in dataset.provenance.get("versions", {}).items()
+    )
     text = f"""---
 pretty_name: Keypoint patches, {len(dataset)} images
 task_categories: [keypoint-detection]

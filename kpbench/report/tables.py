@@ -87,7 +87,7 @@ def to_plain(table: Table, digits: int = 3) -> str:
     n   score
     10  0.500
     """
-    rows = [list(table.columns), *([cell_text(cell, digits) for cell in row] for row in table.rows)]
+    rows = [[cell_text(cell, digits) for cell in row] for row in (table.columns, *table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines)
