@@ -131,7 +131,8 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     name : str
         One of :data:`DETECTORS`; weights ``FILE.onnx`` written by ``kpbench export-model``; ``MODULE:ATTR``; or
         ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, a callable object, or
-        a class whose constructor needs no arguments and makes such an object. MODULE may lie in the current folder.
+        a class whose constructor needs no arguments and makes such an object. MODULE may lie in the current folder,
+        which is searched last.
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
