@@ -59,7 +59,7 @@ bench --suite paper-v1 --images 1 --size 203x155 --only blur --detector orb --de
 train --config recipe.toml --out run
 export-model run/checkpoint.safetensors --out weights.onnx
 detect set --detector weights.onnx --out weights.json
-train --config recipe.toml --init superpoint-small --tensorboard --out run2
+train --config recipe.toml --init weights.onnx --tensorboard --out run2
 export-model small.onnx --int8 --out small-int8.onnx
 train --verifier ellipse set --test set --epochs 0 --workers 1 --out ellipse
 train --verifier judges set --test set --epochs 0 --workers 1 --out judges

@@ -14,7 +14,6 @@ from typing import Any
 import click
 
 from kpbench import __version__
-from kpbench.cli.messages import clean_usage_error, echo, name_options
 from kpbench.errors import KpbenchError, KpbenchWarning
 
 # The module of a command is imported when the command is run: `kpbench --help` must not wait for OpenCV, HDF5 or torch.
@@ -58,7 +57,9 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
-        from kpbench.cli.process import end_by_signals, exit_code  # here, as both would slow down `kpbench --help`
+        # imported here, because these modules would slow down `kpbench --help`
+        from kpbench.cli.messages import clean_usage_error, echo
+        from kpbench.cli.process import end_by_signals, exit_code
         from kpbench.files import protect_read_files
 
         try:
@@ -83,6 +84,8 @@ class LazyGroup(click.Group):
             sys.exit(exit_code())
 
     def _show_warning(self, ctx: click.Context, show: Callable[..., None], message: Warning, *more: Any) -> None:
+        from kpbench.cli.messages import echo
+
         if isinstance(message, KpbenchWarning):
             echo(f"kpbench: {self._translate(ctx, message)}", err=True)
         else:
@@ -90,6 +93,8 @@ class LazyGroup(click.Group):
 
     def _translate(self, ctx: click.Context, problem: BaseException) -> str:
         """Return the message of a problem, with parameters of the library named as options of the command."""
+        from kpbench.cli.messages import name_options
+
         return name_options(str(problem), self.get_command(ctx, ctx.invoked_subcommand or ""))
 
 
