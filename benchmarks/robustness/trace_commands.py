@@ -118,7 +118,10 @@ def prepare(work: Path) -> None:
     """Write the files that the commands read."""
     (work / "pipeline.json").write_text('{"transform": {"__class_fullname__": "Rotate", "limit": [-20, 20], "p": 1.0}}')
     (work / "mine.py").write_text("from kpbench import Detections\ndef find(image): return Detections.none()\n")
-    recipe = 'name = "tiny"\nbatch = 1\nphases = [{ samples = 1 }]\n[samples]\nkind = "crops"\nsize = [32, 32]\n'
+    recipe = (
+        'name = "tiny"\nbatch = 1\nphases = [{ samples = 1 }]\n[samples]\nkind = "crops"\nsize = [32, 32]\n[network]\n'
+    )
+    recipe += "widths = [4, 4, 8, 8]\ndepths = [1, 1, 1, 1]\nhead_width = 8\ndescriptor_width = 8\n"
     (work / "recipe.toml").write_text(recipe)
     from kpbench.detectors.superpoint import WEIGHTS
 
@@ -132,7 +135,7 @@ def main() -> int:
     lines = [shlex.split(line) for line in COMMANDS.strip().splitlines()]
     missing = set(KNOWN) - {line[0] for line in lines}
     bad = bool(missing)
-    print(*(f"{name} is not traced" for name in missing), sep="\n", end="")
+    print(*(f"{name} is not traced\n" for name in sorted(missing)), sep="", end="")
     print("exit  connections  written outside  command")
     with tempfile.TemporaryDirectory() as folder:
         place, work = Path(folder), Path(folder) / "work"

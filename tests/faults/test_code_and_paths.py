@@ -205,10 +205,21 @@ def test_a_board_without_a_name_has_the_name_of_its_file(tmp_path):
     assert load_board(path).name == "my board (copy)"
 
 
-@pytest.mark.parametrize("command", [("suite", "bad.toml"), ("bench", "--suite", "bad.toml")], ids=lambda c: c[0])
-def test_commands_write_nothing_outside_their_folder(here, command):
-    (here / "bad.toml").write_text(suite_text(toml_text(str(here / "escaped" / "suite"))))
-    result = kpbench(*command, code=1)
+@pytest.mark.parametrize(
+    ("kind", "command"),
+    [
+        ("suite", "suite bad.toml"),
+        ("suite", "bench --suite bad.toml"),
+        ("recipe", "train --config bad.toml"),
+        ("board", "render-patches --board bad.toml"),
+        ("patch", "render-patches --design bad.toml"),
+        ("patch", "synth --n 1 --patches bad.toml"),
+        ("patch", "analyze-patches bad.toml"),
+    ],
+)
+def test_commands_write_nothing_outside_their_folder(here, kind, command):
+    (here / "bad.toml").write_text(READERS[kind][1](toml_text(str(here / "escaped" / "name"))))
+    result = kpbench(*command.split(), code=1)
     assert "expected a name" in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert [path.name for path in here.iterdir()] == ["bad.toml"]
