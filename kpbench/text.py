@@ -65,7 +65,7 @@ def escape_markdown(text: str) -> str:
 
 
 def escape_csv(value: object) -> object:
-    """Return the value of a cell that no spreadsheet takes for a formula, and no text of which ends the line.
+    """Return the value of a cell in one line, which no spreadsheet takes for a formula.
 
     A text that begins with =, +, - or @ gets a ``'`` before it. Numbers stay as they are.
     """

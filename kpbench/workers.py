@@ -159,7 +159,7 @@ def _safe_path() -> Iterator[None]:
 
 
 def _restore_safe_path(value: str | None) -> None:
-    os.environ.pop(SAFE_PATH)
+    os.environ.pop(SAFE_PATH, None)
     if value is not None:
         os.environ[SAFE_PATH] = value
 
