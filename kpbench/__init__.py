@@ -10,13 +10,12 @@ Examples
 ['checker', 'trefoil', 'wheel', 'mushroom']
 """
 
-from typing import Any
-
 __version__ = "0.1.0"
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Return a public name. Only the first use parses ``__init__.pyi``, so that the command line starts faster."""
+    # this file imports nothing at its start: `python -m kpbench` runs it while the current folder is on sys.path
     import lazy_loader
 
     this = globals()

@@ -38,6 +38,7 @@ from kpbench.report.score_tables import breakpoint_table, overview_table, paper_
 from kpbench.report.tables import Table
 from kpbench.scoring.scores import Scores, score
 from kpbench.synth.suite import SuiteConfig
+from kpbench.text import LONGEST_NAME
 from kpbench.types import Predictions
 from kpbench.workers import Progress, run_jobs
 from kpbench.writing import remove_file, remove_leftovers, write_file
@@ -191,7 +192,8 @@ def _run_bench(
                 datasets[config] = _make_dataset(config, out / "suites", workers, progress)
             dataset = datasets[config]
             folder = out / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
-            file = folder / f"{re.sub(r'[^A-Za-z0-9.]+', '-', detector.name)}-{_digest_detector(detector)[:8]}.json"
+            stem = re.sub(r"[^A-Za-z0-9.]+", "-", detector.name)[:LONGEST_NAME]
+            file = folder / f"{stem}-{_digest_detector(detector)[:8]}.json"
             runs.append((config, dataset, file))
             if detector.identity is None:
                 _remove_predictions(file)

@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError
@@ -128,6 +128,20 @@ def folder_at(place: str | Path) -> Path:
         reason = " ".join(str(error).split())
         raise DataError(f"{url[0]}: cannot be reached ({reason}); pip install 'kpbench[remote]'") from None
     return folder  # type: ignore[return-value]
+
+
+def path_below(folder: Path, name: str) -> Path:
+    """Return the path of a file below a folder, for a relative path that a file of data names.
+
+    Raises
+    ------
+    DataError
+        If the path is absolute, has ``..`` or a drive letter, or leads out of the folder over a symbolic link.
+    """
+    path, parts = folder / name, PureWindowsPath(name)  # both separators, also on Linux
+    if parts.anchor or ".." in parts.parts or "\0" in name or not path.resolve().is_relative_to(folder.resolve()):
+        raise DataError(f"{name!r} is not read, expected a file below {folder}")
+    return path
 
 
 def is_local(path: object) -> bool:

@@ -13,6 +13,7 @@ from typing import Any
 
 from kpbench.errors import KpbenchError
 from kpbench.files import read_text
+from kpbench.text import NAME_RULE, is_name
 
 LARGEST = sys.float_info.max
 """Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
@@ -97,6 +98,13 @@ class TomlTable:
         if not isinstance(value, str) or not value:
             raise self.problem(key, "a non-empty text")
         return value
+
+    def name(self, key: str = "name", default: str | None = None) -> str:
+        """Return a name, which may become a part of a path. See :func:`kpbench.text.is_name`."""
+        value = self.values.get(key, default)
+        if not is_name(value):
+            raise self.problem(key, NAME_RULE)
+        return str(value)
 
     def choice(self, key: str, choices: Collection[str], default: str | None = None) -> str:
         """Return a text that is one of the choices."""

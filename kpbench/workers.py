@@ -37,6 +37,8 @@ PROGRESS_INTERVAL_S = 0.2
 """Longest time between two reports of progress, s, so that a progress bar moves smoothly."""
 JOBS_AHEAD = 4
 """Number of jobs per worker process that :func:`run_in_order` submits ahead of the results that are asked for."""
+SAFE_PATH = "PYTHONSAFEPATH"
+"""Environment variable that keeps Python from putting the current folder first on ``sys.path``."""
 WORKER_DIED = "a worker process died (out of memory?)"
 
 
@@ -146,17 +148,34 @@ def run_in_order(work: Callable[[JobT], ResultT], jobs: Iterable[JobT], workers:
 
 
 @contextmanager
+def _safe_path() -> Iterator[None]:
+    """Let Python processes that start within a ``with`` block not search the current folder for modules."""
+    before = os.environ.get(SAFE_PATH)
+    os.environ[SAFE_PATH] = "1"
+    try:
+        yield
+    finally:
+        _restore_safe_path(before)
+
+
+def _restore_safe_path(value: str | None) -> None:
+    os.environ.pop(SAFE_PATH, None)
+    if value is not None:
+        os.environ[SAFE_PATH] = value
+
+
+@contextmanager
 def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     """Start worker processes; yield their pool, and the counter of finished images that the processes share.
 
     The processes are killed if the block ends early: by an error, or because no more results are asked for.
     """
     spawn = multiprocessing.get_context("spawn")  # a forked OpenCV, HDF5 or torch may hang
-    with block_end_signals():
+    with block_end_signals(), _safe_path():
         resource_tracker.ensure_running()  # else the next line starts this process of multiprocessing
     counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter,))
-    with block_end_signals():
+    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter, os.environ.get(SAFE_PATH)))
+    with block_end_signals(), _safe_path():
         for _ in range(workers):
             pool.submit(int)  # each empty job starts a process, so that the next line finds all
     processes = set(multiprocessing.active_children()) - others
@@ -248,10 +267,11 @@ _counter: Any = None
 """The counter of finished images that a worker process shares with its parent."""
 
 
-def _start_worker(counter: Any) -> None:
+def _start_worker(counter: Any, safe_path: str | None) -> None:
     """Prepare a new worker process: use one thread, and end with the parent process."""
     global _counter
     _counter = counter
+    _restore_safe_path(safe_path)  # for programs that the worker starts
     use_one_thread()
     _end_with_parent()
 

@@ -57,7 +57,9 @@ class LazyGroup(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> object:
-        from kpbench.cli.process import end_by_signals, exit_code  # here, as both would slow down `kpbench --help`
+        # imported here, because these modules would slow down `kpbench --help`
+        from kpbench.cli.messages import clean_usage_error, echo
+        from kpbench.cli.process import end_by_signals, exit_code
         from kpbench.files import protect_read_files
 
         try:
@@ -66,28 +68,32 @@ class LazyGroup(click.Group):
                 warnings.showwarning = partial(self._show_warning, ctx, warnings.showwarning)
                 return super().invoke(ctx)
         except KpbenchError as error:
-            click.echo(f"kpbench: {self._translate(ctx, error)}", err=True)
+            echo(f"kpbench: {self._translate(ctx, error)}", err=True)
             sys.exit(1)
+        except click.ClickException as error:
+            raise clean_usage_error(error) from None
         except OSError as error:  # usually of standard output: an unwritable file raises KpbenchError
             if not isinstance(error, BrokenPipeError):  # the reader closed the pipe: no message needed
-                click.echo(f"kpbench: {error.strerror or error}", err=True)
+                echo(f"kpbench: {error.strerror or error}", err=True)
             # without a replacement, Python would write to the broken stdout at exit, and exit with code 120
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             sys.exit(1)
         except (KeyboardInterrupt, click.Abort) as stop:
-            click.echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
+            echo(f"kpbench: interrupted{f': {self._translate(ctx, stop)}' if str(stop) else ''}", err=True)
             sys.exit(exit_code())
 
     def _show_warning(self, ctx: click.Context, show: Callable[..., None], message: Warning, *more: Any) -> None:
+        from kpbench.cli.messages import echo
+
         if isinstance(message, KpbenchWarning):
-            click.echo(f"kpbench: {self._translate(ctx, message)}", err=True)
+            echo(f"kpbench: {self._translate(ctx, message)}", err=True)
         else:
             show(message, *more)
 
     def _translate(self, ctx: click.Context, problem: BaseException) -> str:
         """Return the message of a problem, with parameters of the library named as options of the command."""
-        from kpbench.cli.messages import name_options  # imported here to keep `kpbench --help` fast
+        from kpbench.cli.messages import name_options
 
         return name_options(str(problem), self.get_command(ctx, ctx.invoked_subcommand or ""))
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from kpbench.cli.messages import echo
 from kpbench.cli.options import BACKGROUNDS, FileOfSuffix
 
 if TYPE_CHECKING:
@@ -69,8 +70,8 @@ def analyze_patches(
             progress=progress,
         )
     if found.search:
-        click.echo(_search_summary(found.search) + "\n")
-    click.echo("\n\n".join(f"{table.title}:\n{to_plain(table)}" for table in _tables(found.analysis)))
+        echo(_search_summary(found.search) + "\n", lines=True)
+    echo("\n\n".join(f"{table.title}:\n{to_plain(table)}" for table in _tables(found.analysis)), lines=True)
 
 
 def _tables(analysis: Analysis) -> list[Table]:

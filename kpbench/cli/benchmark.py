@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.messages import print_warning
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, WORKERS
 
 
@@ -88,10 +88,9 @@ def bench(
         raise KeyboardInterrupt("finished work is kept; the same command continues the run") from None
     for report in write_suite_reports(runs, out, command=["kpbench", *sys.argv[1:]]):
         for table in report.tables:
-            click.echo(to_markdown(table))
-        click.echo(
-            f"{report.page}: the report of {report.suite}\n{report.scores_folder}: the scores, one file per detector"
-        )
+            echo(to_markdown(table), lines=True)
+        echo(f"{report.page}: the report of {report.suite}")
+        echo(f"{report.scores_folder}: the scores, one file per detector")
     failed = [(run, failure) for run in runs for failure in run.failures]
     if failed:
         for run, (image_id, problem) in failed[:5]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from kpbench.cli.messages import print_warning
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.score import FILE, scoring_options
 
 
@@ -36,7 +36,8 @@ def compare(files: tuple[Path, ...], fail_on_regression: bool, **arguments: Any)
     if len(files) < 2:
         raise click.UsageError("expected two or more predictions files")
     compared = compare_files(files, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
-    click.echo(f"dataset {compared.dataset.path}, fingerprint {compared.dataset.fingerprint[:16]}\n")
-    click.echo(summarise_comparisons(compared.comparisons))
+    echo(f"dataset {compared.dataset.path}, fingerprint {compared.dataset.fingerprint[:16]}")
+    echo()
+    echo(summarise_comparisons(compared.comparisons), lines=True)
     if fail_on_regression:
         check_regression(compared.comparisons)

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.messages import echo
+
 DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
 
 
@@ -22,14 +24,14 @@ def inspect(dataset: Path) -> None:
     from kpbench.dataset.folder import open_dataset
 
     data = open_dataset(dataset)
-    click.echo(f"{'dataset':12} {data.path}")
+    echo(f"{'dataset':12} {data.path}")
     for name, value in dataset_facts(data).items():
-        click.echo(f"{name:12} {value}")
+        echo(f"{name:12} {value}")
     for histogram in dataset_histograms(data):
-        click.echo(histogram.title)
+        echo(histogram.title)
         most = max(int(histogram.counts.max()), 1)
         for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True):
-            click.echo(f"  {label:>14} {count:>8} {share:6.1%} {'#' * round(30 * count / most)}")
+            echo(f"  {label:>14} {count:>8} {share:6.1%} {'#' * round(30 * count / most)}")
 
 
 @click.command()
@@ -48,7 +50,7 @@ def verify(dataset: Path) -> None:
     with progress_bar(len(data), "verify") as progress:
         for shard in data.verify():
             progress(shard.count)
-    click.echo(f"{dataset}: {len(data)} images in {len(data.shards)} shards, all as written")
+    echo(f"{dataset}: {len(data)} images in {len(data.shards)} shards, all as written")
 
 
 @click.command()
@@ -75,7 +77,7 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     target = out or data.path / "preview.png"
     require_writable(target, "picture")
     write_file(target, encode_png(draw_overview(data, count, columns, tile_width)))
-    click.echo(str(target))
+    echo(target)
 
 
 @click.command()
@@ -99,6 +101,6 @@ def export(dataset: Path, file_format: str, out: Path | None) -> None:
     data = open_dataset(dataset)
     try:
         with progress_bar(len(data), "export") as progress:
-            click.echo(str(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress)))
+            echo(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress))
     except KeyboardInterrupt:
         raise KeyboardInterrupt("the same command continues the export") from None

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.messages import echo
 from kpbench.cli.options import FINITE, SEED
 
 
@@ -49,5 +50,5 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     images = open_own_images(source, out)
     with progress_bar(images.length, "degrade") as progress:
         for path, applied in degrade_files(images, out, steps, seed):
-            click.echo(f"{path} {json.dumps(applied)}")
+            echo(f"{path} {json.dumps(applied)}")
             progress(1)

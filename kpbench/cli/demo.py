@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.messages import echo
 from kpbench.cli.options import BACKGROUNDS
 
 
@@ -42,13 +43,15 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
     ]
     kpbench = ctx.find_root().command
     for title, arguments in steps:
-        click.secho(f"\n{title}: kpbench {' '.join(arguments)}", bold=True)
+        echo()
+        echo(f"{title}: kpbench {' '.join(arguments)}", bold=True)
         with kpbench.make_context("kpbench", arguments, parent=ctx.parent) as step:
             kpbench.invoke(step)
-    click.secho("\nOpen:", bold=True)
+    echo()
+    echo("Open:", bold=True)
     for name, content in (
         ("print/patches.pdf", "the print sheet"),
         ("contact-sheet.png", "images with their true keypoints"),
         ("scores.json", "all scores"),
     ):
-        click.echo(f"  {out / name}  {content}")
+        echo(f"  {out / name}  {content}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from kpbench.cli.messages import print_warning
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
@@ -85,7 +85,7 @@ def detect(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"{out} is not written; the same command starts anew") from None
     write_predictions(out, run.predictions)
-    click.echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
+    echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
     if run.failures:
         for label, problem in run.failures[:5]:
             print_warning(f"{label}: {problem}")

@@ -1,4 +1,4 @@
-"""Messages of the library for the command line: names of parameters become names of options."""
+"""What the commands print: the one function that prints, and messages of the library in words of the command line."""
 
 from __future__ import annotations
 
@@ -6,12 +6,30 @@ import re
 
 import click
 
+from kpbench.text import escape_terminal
+
 OPTION_OF = {
     "augmentation": "--augment",
     "shards": "--shard-range",
     "size_px": "--size",
 }
 """Options whose names differ from the names of the library's parameters, for all commands."""
+
+
+def echo(text: object = "", *, lines: bool = False, err: bool = False, bold: bool | None = None) -> None:
+    """Print a line to stdout, or with ``err`` to stderr. Every command prints through this function.
+
+    File names and names in files may hold anything. Control characters, escape sequences and line feeds are therefore
+    printed as escapes such as ``\\x1b``. With ``lines``, the text is a table or has several lines, and line feeds stay.
+    """
+    click.secho(escape_terminal(str(text), lines), err=err, bold=bold)
+
+
+def clean_usage_error(error: click.ClickException) -> click.ClickException:
+    """Return an error that click will print itself, with the message as :func:`echo` would print it."""
+    text = escape_terminal(error.format_message(), lines=True)
+    error.format_message = lambda: text  # type: ignore[method-assign]
+    return error
 
 
 def name_options(message: str, command: click.Command | None) -> str:
@@ -39,4 +57,4 @@ def name_options(message: str, command: click.Command | None) -> str:
 
 def print_warning(message: str) -> None:
     """Print one line to stderr, with parameters of the library named as options of the running command."""
-    click.echo(f"kpbench: {name_options(message, click.get_current_context().command)}", err=True)
+    echo(f"kpbench: {name_options(message, click.get_current_context().command)}", err=True)

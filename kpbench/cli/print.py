@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from kpbench.cli.messages import echo
 from kpbench.cli.options import Finite, Two
 
 if TYPE_CHECKING:
@@ -107,7 +108,7 @@ def render_patches(
     _check_usage(given, board)
     if measured is not None:
         for path in correct_sidecars(out, measured):
-            click.echo(path)
+            echo(path)
         return
     patches = load_patches(designs) if designs else shipped_patches()
     if chosen:
@@ -122,8 +123,8 @@ def render_patches(
         else:
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
     for path in files:
-        click.echo(path)
-    click.echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
+        echo(path)
+    echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
 
 
 def _check_usage(given: set[str], board: str | None) -> None:

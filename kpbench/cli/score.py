@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from kpbench.cli.messages import print_warning
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import FileOfSuffix, Finite
 
 
@@ -119,7 +119,7 @@ def score(
 
     scored = score_file(preds, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
     scores, dataset = scored.scores, scored.dataset
-    click.echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
-    click.echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
-    click.echo(summarise_scores(scores, scored.poses))
+    echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
+    echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
+    echo(summarise_scores(scores, scored.poses), lines=True)
     check_gates(scores, dict(least), dict(most))

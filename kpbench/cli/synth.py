@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from kpbench.cli.messages import print_warning
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import BACKGROUNDS, PATCHES, SEED, SIZE, Two, run_options
 
 if TYPE_CHECKING:
@@ -156,7 +156,7 @@ def write_dataset(
             how["progress"] = progress
             if shards is not None:
                 images = generate_part(config, out, shards, **how)
-                click.echo(f"{out}: {images} images in shards {shards.start}:{shards.stop}; no manifest yet")
+                echo(f"{out}: {images} images in shards {shards.start}:{shards.stop}; no manifest yet")
                 return
             result = generate(config, out, **how)
     except KeyboardInterrupt:
@@ -169,6 +169,4 @@ def write_dataset(
 
 def print_dataset(dataset: Dataset) -> None:
     """Print one line about a finished dataset."""
-    click.echo(
-        f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}"
-    )
+    echo(f"{dataset.path}: {len(dataset)} images, {len(dataset.shards)} shards, fingerprint {dataset.fingerprint[:16]}")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import click
 
+from kpbench.cli.messages import echo
 from kpbench.cli.options import BACKGROUNDS, PATCHES
 
 EPOCHS = {"ellipse": 6, "judges": 10}
@@ -159,9 +160,9 @@ def _train_detector(
         options=TrainOptions(
             init, resume, minutes, 1 if workers is None else workers, threads, tensorboard=tensorboard
         ),
-        say=lambda line: click.echo(line, err=True),
+        say=lambda line: echo(line, err=True),
     )
-    click.echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
+    echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
 
 
 def _train_verifier(
@@ -190,7 +191,7 @@ def _train_verifier(
         from_shipped=from_shipped,
         workers=count_cores() if workers is None else workers,
         threads=threads,
-        say=click.echo,
+        say=echo,
     )
 
 
@@ -212,4 +213,4 @@ def export_model(checkpoint: Path, out: Path, int8: bool) -> None:
         from kpbench.training.export import export_onnx
         from kpbench.training.quantise import export_int8
     done, other = (export_int8(checkpoint, out), "float32") if int8 else (export_onnx(checkpoint, out), "PyTorch")
-    click.echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {other} by at most {done.difference:.1e}")
+    echo(f"{out}: {done.bytes} bytes, step {done.step}, differs from {other} by at most {done.difference:.1e}")

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
 from kpbench.images import encode_png
+from kpbench.text import escape_markdown
 from kpbench.types import Float, UInt8
 from kpbench.writing import is_replaceable, write_file
 
@@ -181,8 +182,10 @@ def write_card(dataset: Dataset, folder: Path) -> None:
     if not is_replaceable(folder / card, "card"):
         return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
-    facts = "\n".join(f"| {key} | {value} |" for key, value in dataset_facts(dataset).items())
-    versions = ", ".join(f"{name} {version}" for name, version in dataset.provenance.get("versions", {}).items())
+    facts = "\n".join(f"| {key} | {escape_markdown(value)} |" for key, value in dataset_facts(dataset).items())
+    versions = ", ".join(
+        escape_markdown(f"{name} {version}") for name, version in dataset.provenance.get("versions", {}).items()
+    )
     text = f"""---
 pretty_name: Keypoint patches, {len(dataset)} images
 task_categories: [keypoint-detection]
@@ -217,7 +220,7 @@ Made with {versions}.
 
 def _markdown_table(histogram: Histogram) -> str:
     rows = [
-        f"| {label} | {count} | {share:.1%} |"
+        f"| {escape_markdown(label)} | {count} | {share:.1%} |"
         for label, count, share in zip(histogram.labels, histogram.counts, histogram.shares, strict=True)
     ]
     return "\n".join([f"| {histogram.title} | | |", "|---|---|---|", *rows])

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from kpbench.dataset.shard import DATASET_SCHEMA, canonical_json, encode_utf8, open_shard, shard_errors
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, note_read, sha256_of
+from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
 
@@ -236,7 +237,7 @@ def open_dataset(path: str | Path) -> Dataset:
     if not dataset.shards:
         raise DataError(f"{folder / MANIFEST}: lists no shards")
     for shard in dataset.shards:
-        if Path(shard.file).name != shard.file:
+        if not is_name(shard.file):
             raise DataError(f"{folder / MANIFEST}: shard {shard.file!r} is not a plain file name")
         try:
             size = (folder / shard.file).stat().st_size

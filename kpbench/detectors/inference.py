@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -40,10 +40,21 @@ class OpenVinoSession:
         return [np.array(results[output]) for output in self._compiled.outputs]
 
 
-def runs_on_gpu() -> bool:
-    """Return whether :func:`open_session` runs networks on CUDA."""
+def import_onnxruntime() -> Any:
+    """Import ONNX Runtime and return the module.
+
+    The environment variable keeps the library from sending telemetry over the network and from writing the number of a
+    device into the user's cache.
+    """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
 
+    return onnxruntime
+
+
+def runs_on_gpu() -> bool:
+    """Return whether :func:`open_session` runs networks on CUDA."""
+    onnxruntime = import_onnxruntime()
     return _requested_runtime() in ("auto", "cuda") and "CUDAExecutionProvider" in onnxruntime.get_available_providers()
 
 
@@ -78,8 +89,7 @@ def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]
     DataError
         If ``KPBENCH_RUNTIME`` is not one of :data:`RUNTIMES`, or names a runtime that is not installed.
     """
-    import onnxruntime
-
+    onnxruntime = import_onnxruntime()
     runtime = _requested_runtime()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or cv2.getNumThreads()

@@ -132,7 +132,8 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     name : str
         One of :data:`DETECTORS`; weights ``FILE.onnx`` written by ``kpbench export-model``; ``MODULE:ATTR``; or
         ``program:COMMAND``. ATTR is a function of an image, an object with a method ``detect``, or a class of such
-        objects whose constructor needs no arguments. MODULE may lie in the current folder.
+        objects whose constructor needs no arguments. MODULE may lie in the current folder,
+        which is searched last.
     threshold : float, optional
         Least score of a detection, for a detector with an attribute ``threshold``. None: the detector's own threshold.
     patches : sequence of Patch, optional
@@ -168,6 +169,8 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
             "or program:COMMAND of your own"
         )
+    if name not in DETECTORS:
+        _search_current_folder()
     found = _import_attribute(DETECTORS.get(name, name))
     try:
         if isinstance(found, type):
@@ -212,11 +215,15 @@ def _set_threshold(detector: Any, threshold: float | None) -> Any:
     return detector
 
 
+def _search_current_folder() -> None:
+    """Let imports find modules in the current folder, after all other places, so that none of them is replaced."""
+    if str(Path.cwd()) not in sys.path:
+        sys.path.append(str(Path.cwd()))
+
+
 def _import_attribute(path: str) -> Any:
     """Return the object that ``MODULE:ATTR`` names."""
     module, _, attribute = path.partition(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
     try:
         return getattr(importlib.import_module(module), attribute)
     except ModuleNotFoundError as error:

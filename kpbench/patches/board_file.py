@@ -98,7 +98,7 @@ def parse_board(
         patches = load_patches([path.parent / file for file in files])
     elif patches is None:
         patches = shipped_patches()
-    name = table.text("name", path.stem)
+    name = table.name() if "name" in table else path.stem
     if ("grid" in table) == ("keypoint" in table):
         raise DesignError("expected one [grid], or at least one [[keypoint]], and not both")
     if "diameter_mm" in table and diameter_mm is not None:

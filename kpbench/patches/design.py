@@ -215,7 +215,7 @@ def parse_patch(content: Mapping[str, Any], source: str) -> Patch:
         table.require_schema(SCHEMA, optional=True)
         rim = table.table("rim", ("width", "ink"), {})
         return Patch(
-            name=table.text("name"),
+            name=table.name(),
             patch_id=table.whole_number("id", 0, 32767),
             disc=table.choice("disc", ("black", "white"), "white"),
             semicircles=tuple(

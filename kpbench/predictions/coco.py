@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
-from kpbench.files import note_read
+from kpbench.files import note_read, path_below
 from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
@@ -103,7 +103,7 @@ class CocoDataset:
     truth : Truth
     files : tuple of str
         File names of the images, relative to the folder of the annotations file or to its ``images`` folder. The
-        files may be missing.
+        files may be missing. A file is read only if it lies below the folder, after symbolic links are followed.
 
     Examples
     --------
@@ -134,12 +134,13 @@ class CocoDataset:
         Raises
         ------
         DataError
-            If the image is missing or cannot be decoded.
+            If the image is missing or cannot be decoded, or the file does not lie below the folder of the annotations.
         """
         import cv2
 
-        for folder in (self.path.parent, self.path.parent / "images"):
-            pixels = cv2.imread(str(folder / self.files[index]), cv2.IMREAD_COLOR) if self.files[index] else None
+        for prefix in ("", "images/") if self.files[index] else ():
+            path = path_below(self.path.parent, prefix + self.files[index])
+            pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
             if pixels is not None:
                 return np.asarray(pixels[..., ::-1], np.uint8)
         raise DataError(f"{self.path.parent / self.files[index]}: no image there that can be decoded")

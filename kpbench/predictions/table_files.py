@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from kpbench.errors import PredictionsError
 from kpbench.predictions.decode import Place, abbreviate, parse_json
 from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
+from kpbench.text import escape_csv_comment
 from kpbench.types import Predictions, offsets_of
 
 LARGEST_RATIO = 1100
@@ -177,7 +178,7 @@ def encode_csv(predictions: Predictions) -> bytes:
     if "id" in frame:
         frame["id"] = frame["id"].astype("Int64")
     text = io.StringIO()
-    text.write(f"# {json.dumps(make_header(predictions), ensure_ascii=False)}\n")
+    text.write(escape_csv_comment(f"# {json.dumps(make_header(predictions), ensure_ascii=False)}\n"))
     frame.to_csv(text, index=False, lineterminator="\n")
     return text.getvalue().encode()
 

@@ -38,6 +38,7 @@ from kpbench.report.score_tables import (
 from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
+from kpbench.text import escape_markdown, escape_terminal
 from kpbench.writing import write_file
 
 if TYPE_CHECKING:
@@ -227,16 +228,16 @@ def _conditions(report: Report) -> list[str]:
 
 def to_markdown_report(report: Report) -> str:
     """Render the tables and the text of a report as Markdown, without charts and pictures."""
-    return _render_text(report, to_markdown, "# {}", "## {}", lambda text: text, "```json\n{}\n```")
+    return _render_text(report, to_markdown, "# {}", "## {}", escape_markdown, "```json\n{}\n```")
 
 
 def to_latex_report(report: Report) -> str:
     """Render the tables of a report as LaTeX, each in a ``table`` environment. Other text becomes comments."""
 
     def comment(text: str) -> str:
-        return "\n".join(f"% {line}" for line in text.splitlines())
+        return "\n".join(f"% {escape_terminal(line)}" for line in text.splitlines())
 
-    return _render_text(report, to_latex, "% {}", "% {}", comment, None)
+    return _render_text(report, to_latex, "{}", "{}", comment, None)
 
 
 def _render_text(
@@ -251,9 +252,9 @@ def _render_text(
 
     Each template contains one ``{}``. If ``provenance_template`` is None, ``format_prose`` formats the provenance.
     """
-    parts = [title_template.format(report.title), format_prose(_describe_images(report))]
+    parts = [title_template.format(format_prose(report.title)), format_prose(_describe_images(report))]
     for section in make_sections(replace(report, cases=())):
-        parts += [section_template.format(section.title), format_prose(section.lead)]
+        parts += [section_template.format(format_prose(section.title)), format_prose(section.lead)]
         parts += [to_text(block) for block in section.blocks if isinstance(block, Table)]
     content = json.dumps(report.provenance, indent=1)
     parts.append(format_prose(content) if provenance_template is None else provenance_template.format(content))

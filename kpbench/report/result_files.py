@@ -18,6 +18,7 @@ from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
+from kpbench.text import escape_csv
 
 TABLE_SCHEMA = "kpbench.table/1"
 COMPARISON_SCHEMA = "kpbench.comparison/1"
@@ -61,7 +62,8 @@ def _encode_json(content: Mapping[str, Any]) -> bytes:
 def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
     """Encode scores as CSV, one row per group. The first row is the group of all images.
 
-    Each row names the detector, the dataset and the version of kpbench, so that tables can be joined.
+    Each row names the detector, the dataset and the version of kpbench, so that tables can be joined. A text that a
+    spreadsheet would take for a formula begins with ``'``.
     """
     about = {
         "schema": TABLE_SCHEMA,
@@ -69,7 +71,7 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
         "dataset": scores.fingerprint,
         "kpbench": provenance["kpbench"],
     }
-    rows = [about | row for row in scores.rows()]
+    rows = [{name: escape_csv(value) for name, value in (about | row).items()} for row in scores.rows()]
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()

@@ -10,6 +10,7 @@ from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
+from kpbench.text import escape_terminal
 
 
 def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
@@ -73,4 +74,4 @@ def summarise_comparisons(comparisons: Sequence[Comparison]) -> str:
 
 
 def _with_title(table: Table) -> str:
-    return f"{table.title}\n{to_plain(table)}"
+    return f"{escape_terminal(table.title)}\n{to_plain(table)}"

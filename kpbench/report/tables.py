@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from kpbench.scoring.bootstrap import Interval
+from kpbench.text import escape_latex, escape_markdown, escape_terminal
 
 
 class Estimate(NamedTuple):
@@ -60,7 +61,7 @@ class Table:
 
 
 def cell_text(cell: Cell, digits: int = 3) -> str:
-    """Write a float with ``digits`` decimals, an estimate as ``0.882 [0.861, 0.901]``, and None as n/a.
+    """Write a float with ``digits`` decimals, an estimate as ``0.882 [0.861, 0.901]``, None as n/a, text in one line.
 
     If ``digits`` is under 4, a nonzero float below 0.01 gets one decimal more.
     """
@@ -73,7 +74,7 @@ def cell_text(cell: Cell, digits: int = 3) -> str:
         return f"{text} [{cell.interval[0]:.{digits}f}, {cell.interval[1]:.{digits}f}]"
     if isinstance(cell, float):
         return f"{cell:.{digits + (0 < abs(cell) < 0.01 and digits < 4)}f}"
-    return str(cell)
+    return escape_terminal(str(cell))
 
 
 def to_plain(table: Table, digits: int = 3) -> str:
@@ -86,7 +87,7 @@ def to_plain(table: Table, digits: int = 3) -> str:
     n   score
     10  0.500
     """
-    rows = [list(table.columns), *([cell_text(cell, digits) for cell in row] for row in table.rows)]
+    rows = [[cell_text(cell, digits) for cell in row] for row in (table.columns, *table.rows)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ["  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
     return "\n".join(lines)
@@ -104,17 +105,14 @@ def to_markdown(table: Table) -> str:
     """
 
     def line(cells: Sequence[str]) -> str:
-        return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+        return f"| {' | '.join(cells)} |"
 
-    lines = [f"**{table.title}**", "", line(table.columns), line(["---"] * len(table.columns))]
-    lines += [line([cell_text(cell) for cell in row]) for row in table.rows]
-    return "\n".join([*lines, *(["", table.note] if table.note else []), ""])
+    def escape(cell: Cell) -> str:
+        return escape_markdown(cell) if isinstance(cell, str) else cell_text(cell)
 
-
-LATEX_OF = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "ε": r"$\varepsilon$"} | {
-    c: f"\\{c}" for c in "&%$#_{}"
-}
-"""LaTeX commands for the characters that LaTeX does not print literally."""
+    lines = [f"**{escape(table.title)}**", "", line([*map(escape, table.columns)]), line(["---"] * len(table.columns))]
+    lines += [line([*map(escape, row)]) for row in table.rows]
+    return "\n".join([*lines, *(["", escape(table.note)] if table.note else []), ""])
 
 
 def to_latex(table: Table) -> str:
@@ -130,14 +128,11 @@ def to_latex(table: Table) -> str:
     a\_b & 0.500 \\
     """
 
-    def escape(text: str) -> str:
-        return "".join(LATEX_OF.get(c, c) for c in text)
-
     def line(cells: Sequence[str]) -> str:
-        return f"{' & '.join(map(escape, cells))} \\\\"
+        return f"{' & '.join(map(escape_latex, cells))} \\\\"
 
     body = [line([cell_text(cell) for cell in row]) for row in table.rows]
-    caption = escape(f"{table.title}. {table.note}" if table.note else table.title)
+    caption = escape_latex(f"{table.title}. {table.note}" if table.note else table.title)
     return "\n".join(
         [
             r"\begin{table}",

@@ -174,7 +174,7 @@ def _parse_suite(table: TomlTable) -> Suite:
         raise DataError(f"two conditions share a name, among: {', '.join(names)}")
     width, height = camera.numbers("size_px", 64, 16384, 2, whole=True)
     return Suite(
-        name=table.text("name"),
+        name=table.name(),
         images=table.whole_number("images", 1, 1_000_000),
         patches=tuple(find_patch(shipped_patches(), key) for key in table.entries("patches", "a list of names or ids")),
         size_px=(int(width), int(height)),
@@ -191,7 +191,7 @@ def _parse_condition(table: TomlTable) -> Condition:
     pose = table.table("pose", SCENE_KEYS, {})
     effects = table.table("effects", LADDER, {})
     return Condition(
-        name=table.text("name"),
+        name=table.name(),
         unit=table.text("unit"),
         rungs=rungs,
         pose=tuple((key, pose.numbers(key, *SCENE_KEYS[key], len(rungs))) for key in pose.values),

@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.detectors.inference import open_session
+from kpbench.detectors.inference import import_onnxruntime, open_session
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.files import note_read
@@ -90,6 +90,7 @@ def quantise(model: Any, feeds: Iterable[dict[str, NDArray[np.float32]]]) -> Any
     feeds : iterable of dict
         Inputs of the network on which the ranges of the activations are measured.
     """
+    import_onnxruntime()
     import onnx
     from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 

@@ -306,6 +306,8 @@ def _parse_field(table: TomlTable, key: str, kind: Any) -> Any:
         return table.numbers(key, 0, count=None if last is Ellipsis else len(get_args(kind)), whole=element is int)
     if kind is bool:
         return table.flag(key)
+    if key == "name":
+        return table.name()
     if kind is str:
         return table.choice(key, CHOICES[key]) if key in CHOICES else table.text(key)
     return table.whole_number(key, 0) if kind is int else table.number(key, 0)

@@ -165,7 +165,7 @@ POINT = "[[keypoint]]\npatch = 0\nx_mm = 0\ny_mm = 0\n"
         ("x = ", "not valid TOML"),
         ('schema = "kpbench.board-design/9"\n' + GRID, "schema is 'kpbench.board-design/9', expected"),
         ("colour = 1\n" + GRID, "unknown key 'colour'; known are: schema, name"),
-        ('name = ""\n' + GRID, "name is '', expected a non-empty text"),
+        ('name = ""\n' + GRID, "name is '', expected a name of at most 100 letters"),
         ("diameter_mm = 0\n" + GRID, "diameter_mm is 0, expected a number from 0.1 to 5000"),
         ("diameter_mm = nan\n" + GRID, "diameter_mm is nan, expected a number"),
         ("size_mm = 3\n" + GRID, "size_mm is 3, expected a list of 2 numbers"),

@@ -105,7 +105,7 @@ def test_markdown_keeps_its_columns():
 def test_latex_is_escaped():
     text = to_latex(TABLE)
     assert r"\caption{A \& B. 100 \% \{n\}}" in text
-    assert r"name & a|b & x\_y \\" in text
+    assert r"name & a\textbar{}b & x\_y \\" in text
     assert r"$\varepsilon$ & 0.0004 & 2.000 \\" in text
     assert text.count(r"\begin{tabular}{lrr}") == text.count(r"\end{tabular}") == 1
 
