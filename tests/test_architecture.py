@@ -31,7 +31,9 @@ GROUND = {
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],
     "signals": [],
-    "images": ["errors", "types", "files", "writing"],
+    "pixels": ["errors", "types"],
+    "films": ["errors", "types", "pixels"],
+    "images": ["errors", "types", "files", "writing", "pixels", "films"],
     "workers": ["errors", "signals"],
     "seeds": [],
 }

@@ -15,7 +15,7 @@ from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detector
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
-from kpbench.images import ImageSource, image_writer
+from kpbench.images import UNDECODABLE, ImageSource, image_writer
 from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
@@ -156,13 +156,13 @@ def predict_images(
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
     with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
-            result = (Detections.none(), "cannot be decoded")
-            if image is not None:
+            if image is None:
+                result = (Detections.none(), source.problems.get(label, UNDECODABLE))
+            else:
                 result = _detect(loaded, image, threshold)
             found.append(result)
             labels.append(label)
-            if image is not None:
-                draw(label, draw_detections(image, result[0]))
+            draw(label, None if image is None else draw_detections(image, result[0]))
             progress(1)
     return _collect(loaded, found, labels, np.arange(len(found)))
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import note_read
+from kpbench.images import read_rgb
 from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
@@ -136,12 +137,10 @@ class CocoDataset:
         DataError
             If the image is missing or cannot be decoded.
         """
-        import cv2
-
         for folder in (self.path.parent, self.path.parent / "images"):
-            pixels = cv2.imread(str(folder / self.files[index]), cv2.IMREAD_COLOR) if self.files[index] else None
+            pixels = read_rgb(folder / self.files[index]) if self.files[index] else None
             if pixels is not None:
-                return np.asarray(pixels[..., ::-1], np.uint8)
+                return pixels
         raise DataError(f"{self.path.parent / self.files[index]}: no image there that can be decoded")
 
 
