@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -24,6 +25,10 @@ _ORIENTATION, _MAX_SAMPLE_VALUE, _EXTRA_SAMPLES = 274, 281, 338
 """TIFF tags: how the camera was held; the largest value of the samples; what further channels are (1, 2: opacity)."""
 _PNG_GREY_ALPHA, _PNG_RGBA = 4, 6
 """Colour types of PNG (ISO 15948, 11.2.2)."""
+
+
+SIDEWAYS = (5, 6, 7, 8)
+"""Orientations of EXIF in which the width of the stored pixels is the height of the picture."""
 
 
 class Notes:
@@ -188,17 +193,32 @@ def png_chunk(data: NDArray[np.uint8], name: bytes) -> bytes:
 
 def _rotate(image: UInt8, data: NDArray[np.uint8]) -> UInt8:
     """Rotate and flip an image as its EXIF data says."""
-    from PIL import Image
-
-    try:
-        with Image.open(io.BytesIO(data.tobytes())) as file:
-            orientation = file.getexif().get(_ORIENTATION, 1)
-    except Exception:  # Pillow raises errors of many types; without EXIF data the picture stands as it is
-        orientation = 1
-    if orientation in (5, 6, 7, 8):
+    orientation = _size_and_orientation(io.BytesIO(data.tobytes()))[1]
+    if orientation in SIDEWAYS:
         image = image.transpose(1, 0, 2)
     if orientation in (3, 4, 7, 8):
         image = image[::-1]
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
     return np.ascontiguousarray(image)
+
+
+def read_size(path: Path) -> tuple[int, int] | None:
+    """Return width and height of an image as it is shown, rotated by its EXIF data; None if it is no image."""
+    (width, height), orientation = _size_and_orientation(path)
+    if not width:
+        return None
+    return (height, width) if orientation in SIDEWAYS else (width, height)
+
+
+def _size_and_orientation(file: Path | io.BytesIO) -> tuple[tuple[int, int], int]:
+    """Return the size of the stored pixels, (0, 0) if there are none, and the orientation in the EXIF data, else 1."""
+    from PIL import Image
+
+    size = (0, 0)
+    try:
+        with Image.open(file) as image:
+            size = image.size
+            return size, int(image.getexif().get(_ORIENTATION, 1))
+    except Exception:  # Pillow raises errors of many types
+        return size, 1
