@@ -116,16 +116,16 @@ def read_csv(path: Path) -> Predictions:
     header, skipped = {}, 0
     if data.startswith(b"#"):
         first, data = _cut_line(data)
-        header, skipped = parse_header(parse_json(first[1:], "line 1, after #,")), 1
+        header, skipped = parse_header(parse_json(first[1:].encode(), "line 1, after #,")), 1
     first, data = _cut_line(data)
-    names = _check_columns(next(csv.reader([first.decode(errors="replace")]), []), f"line {1 + skipped}")
+    names = _check_columns(next(csv.reader([first]), []), f"line {1 + skipped}")
 
     def place(row: int) -> str:
         return f"line {row + 2 + skipped}"
 
     try:
         table = _parse_csv(data, names)
-    except (ValueError, Warning) as error:  # the errors of pandas' parser are ValueErrors
+    except (ValueError, Warning, csv.Error) as error:  # the errors of pandas' parser are ValueErrors
         raise _find_bad_row(data, names, place, error) from None
     predictions = build_predictions(table, header, place)
     if not is_ended:
@@ -133,12 +133,15 @@ def read_csv(path: Path) -> Predictions:
     return predictions
 
 
-def _cut_line(data: bytes) -> tuple[bytes, bytes]:
+def _cut_line(data: bytes) -> tuple[str, bytes]:
     """Return the first line without its end, and the lines after it."""
     line, _, rest = data.partition(b"\n")
     if b"\r" in line.rstrip(b"\r"):  # lines end in carriage returns alone
         line, _, rest = data.partition(b"\r")
-    return line.rstrip(b"\r"), rest
+    try:
+        return line.rstrip(b"\r").decode(), rest
+    except UnicodeDecodeError:
+        raise PredictionsError("its first lines are no UTF-8 text") from None
 
 
 def _parse_csv(data: bytes, names: list[str]) -> dict[str, NDArray[Any]]:
@@ -170,7 +173,11 @@ def _parse_csv(data: bytes, names: list[str]) -> dict[str, NDArray[Any]]:
             skip_blank_lines=False,
             encoding_errors="replace",
         )
-    if b'"' not in data and data.count(b",") != (len(names) - 1) * len(table):  # pandas fills up short rows in silence
+    # pandas fills up short rows in silence, and reads quotation marks that do not pair
+    is_quoted = b'"' in data
+    if is_quoted and any(len(row) != len(names) for row in csv.reader(io.StringIO(data.decode()), strict=True)):
+        raise ValueError("a row is too short")
+    if not is_quoted and data.count(b",") != (len(names) - 1) * len(table):
         raise ValueError("a row is too short")
     columns: dict[str, NDArray[Any]] = {}
     for name in names:
