@@ -150,6 +150,8 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
     try:
         image = Image.open(io.BytesIO(data.tobytes()))
         length = getattr(image, "n_frames", 1)
+        if is_webp:
+            image.load()  # which reads the duration
     except Exception:  # damaged in a way that Pillow has an error of its own for; OpenCV may read the first frame
         return None
     if length < 2:

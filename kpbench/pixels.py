@@ -81,10 +81,14 @@ def decode_pixels(
         return None
 
 
-def lay_on_white(rgba: UInt8) -> UInt8:
-    """Return an image with a fourth channel of opacity (H, W, 4) as the three colours over white."""
-    opacity = rgba[..., 3:].astype(np.uint16)
-    return ((rgba[..., :3] * opacity + 255 * (255 - opacity) + 127) // 255).astype(np.uint8)
+def lay_on_white(image: UInt8, is_multiplied: bool = False) -> UInt8:
+    """Return an image with a fourth channel of opacity (H, W, 4) as its three colours over white.
+
+    ``is_multiplied`` : whether the colours are multiplied by the opacity already, as libtiff gives them.
+    """
+    opacity = image[..., 3:].astype(np.uint32)
+    ink = 255 * image[..., :3].astype(np.uint32) if is_multiplied else image[..., :3] * opacity
+    return np.asarray(np.minimum((ink + 255 * (255 - opacity) + 127) // 255, 255), np.uint8)
 
 
 def bits_used(largest: int, declared: int | None = None) -> int:
@@ -144,7 +148,7 @@ def _decode_deep_or_transparent(
     if is_transparent:
         if notes is not None:
             notes.warn(name, "is transparent, and is laid on white")
-        image = lay_on_white(image)
+        image = lay_on_white(image, is_multiplied=bits == 8 and _is_tiff(data))
     return _rotate(image[..., :3], data) if rotate else np.ascontiguousarray(image[..., :3])
 
 
@@ -159,12 +163,16 @@ def _declared_bits(data: NDArray[np.uint8]) -> int | None:
 
 def _has_other_channel(data: NDArray[np.uint8]) -> bool:
     """Return whether the fourth channel is no opacity: ink of a CMYK TIFF, infrared, and so on."""
-    return data[:4].tobytes() in _TIFF_SIGNATURES and not {1, 2} & set(_tiff_tag(data, _EXTRA_SAMPLES))
+    return _is_tiff(data) and not {1, 2} & set(_tiff_tag(data, _EXTRA_SAMPLES))
+
+
+def _is_tiff(data: NDArray[np.uint8]) -> bool:
+    return data[:4].tobytes() in _TIFF_SIGNATURES
 
 
 def _tiff_tag(data: NDArray[np.uint8], tag: int) -> tuple[int, ...]:
     """Return the numbers of a tag of a TIFF; () if there are none."""
-    if data[:4].tobytes() not in _TIFF_SIGNATURES:
+    if not _is_tiff(data):
         return ()
     from PIL import TiffImagePlugin
 
