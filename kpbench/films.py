@@ -66,7 +66,8 @@ def open_video(path: Path) -> Film:
     if length is None and stated > 0:
         warnings.warn(f"{path}: states {stated} frames, more than it can hold", KpbenchWarning, stacklevel=3)
     fps = _fps(capture)
-    return Film(_video_frames(capture, length, fps, path.suffix.lower() in COUNTING_SUFFIXES), length, fps)
+    frames = _video_frames(capture, length, fps, path.suffix.lower() in COUNTING_SUFFIXES)
+    return Film(_require_any(frames, path), length, fps)
 
 
 def open_camera(number: int) -> Film:
@@ -100,6 +101,16 @@ def _fps(capture: cv2.VideoCapture) -> float:
 
 def _rgb(frame: NDArray[Any]) -> UInt8:
     return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _require_any(frames: Iterator[UInt8 | None], path: Path) -> Iterator[UInt8 | None]:
+    """Pass the frames on; raise an error if there are none."""
+    is_empty = True
+    for frame in frames:
+        is_empty = False
+        yield frame
+    if is_empty:
+        raise DataError(f"{path}: holds no frame that can be read")
 
 
 def _video_frames(

@@ -36,6 +36,7 @@ GROUND = {
     "images": ["errors", "types", "files", "writing", "pixels", "films"],
     "workers": ["errors", "signals"],
     "seeds": [],
+    "opencv": ["errors"],
 }
 """What every stage shares, and what each of these modules may import."""
 ROOMS = {

@@ -22,7 +22,7 @@ from kpbench.dataset.shard import (
     read_text_attribute,
     shard_errors,
 )
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.files import folder_at, is_local, note_read, sha256_of
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
@@ -277,8 +277,10 @@ def open_dataset(path: str | Path) -> Dataset:
     for shard in dataset.shards:
         try:
             size = (folder / shard.file).stat().st_size
-        except OSError:
+        except FileNotFoundError:
             raise DataError(f"{folder / shard.file}: missing, listed in {MANIFEST}") from None
+        except OSError as error:
+            raise DataError(f"{folder / shard.file}: cannot be read, {system_reason(error) or error}") from None
         if size != shard.bytes:
             raise DataError(f"{folder / shard.file}: damaged, has {size} bytes, expected {shard.bytes}")
     return dataset
@@ -302,7 +304,7 @@ def _read_manifest(folder: Path) -> Dataset:
     except NotADirectoryError:
         raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
-        raise DataError(f"{manifest}: cannot be read, {error.strerror}") from None
+        raise DataError(f"{manifest}: cannot be read, {system_reason(error) or error}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         expected = "JSON with schema, config, fingerprint and shards"
         raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None

@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.files import is_local, note_read
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
@@ -182,6 +182,8 @@ def shard_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+        if reason := system_reason(error):
+            raise DataError(f"{path}: cannot be read, {reason}") from None
         raise DataError(f"{path}: damaged or no kpbench shard ({' '.join(str(error).split())[:160]})") from None
 
 
@@ -206,7 +208,8 @@ def open_shard(path: Path) -> Any:
     with shard_errors(path):
         if is_local(path):
             note_read(path)
-        file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
+        # Shards appear whole under their names, so reading needs no lock, which some file systems do not have
+        file = h5py.File(path, "r", locking=False) if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
         with shard_errors(path):
             _check_shard(file, path.stat().st_size)

@@ -16,6 +16,7 @@ from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detect
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import UNDECODABLE, ImageSource, image_writer
+from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
@@ -96,6 +97,7 @@ def predict(
     if isinstance(source, ImageSource):
         return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress)
     dataset = source
+    warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):
         workers = 1
@@ -151,6 +153,7 @@ def predict_images(
     >>> predict_images(ImageSource(images, 2), "template").failures
     (('broken.png', 'cannot be decoded'),)
     """
+    warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[ImageResult](), list[str]()
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
@@ -174,7 +177,7 @@ def _collect(
         raise DataError(
             f"detector {detector.name}: failed on all {len(found)} images, first {labels[0]}: {found[0][1]}"
         )
-    about = {"name": detector.name, "version": detector.version}
+    about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
     of_dataset = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
     predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
     failures = tuple((label, message) for label, (_, message) in zip(labels, found, strict=True) if message)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
 

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError, KpbenchWarning, PredictionsError
+from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
 from kpbench.files import note_read
 from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
 from kpbench.predictions.table_files import build_predictions
@@ -194,7 +194,7 @@ def open_coco(path: str | Path) -> CocoDataset:
             del content  # freed before the garbage collector resumes and scans it
         return CocoDataset(path, truth, files)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
+        raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
     except (DataError, PredictionsError) as error:
         raise DataError(f"{path}: {error}") from None
 

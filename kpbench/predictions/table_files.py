@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import KpbenchWarning, PredictionsError
+from kpbench.errors import KpbenchWarning, PredictionsError, system_reason
 from kpbench.predictions.decode import Place, abbreviate, parse_json
 from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
 from kpbench.types import Predictions, offsets_of
@@ -302,7 +302,7 @@ def read_h5(path: Path) -> Predictions:
 
     columns: dict[str, NDArray[Any]] = {}
     try:
-        with h5py.File(path, "r", locking="best-effort") as file:
+        with h5py.File(path, "r", locking=False) as file:
             header = {}
             if "header" in file.attrs:
                 header = parse_header(parse_json(_to_bytes(file.attrs["header"]), "the attribute header"))
@@ -323,6 +323,8 @@ def read_h5(path: Path) -> Predictions:
                     raise PredictionsError(f"/{name} is {data.dtype} of shape {data.shape}, expected {kind}8 columns")
                 columns[name] = data[:]
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+        if reason := system_reason(error):
+            raise PredictionsError(f"cannot be read, {reason}") from None
         raise PredictionsError(f"damaged or no HDF5 file ({' '.join(str(error).split())[:120]})") from None
     if columns["xy"].shape[1:] != (2,):
         raise PredictionsError(f"/xy has shape {columns['xy'].shape}, expected (K, 2)")

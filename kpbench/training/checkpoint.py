@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kpbench import __version__
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.patches.design import Patch
 from kpbench.training.network import SuperPoint
 from kpbench.training.recipe import Recipe, parse_recipe
@@ -127,7 +127,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
             content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError, ValueError) as error:
-        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error).splitlines()[0]})") from None
+        why = system_reason(error) or str(error).splitlines()[0]
+        raise DataError(f"{path}: cannot be read as a checkpoint ({why})") from None
     if content.get("schema") != SCHEMA:
         raise DataError(f"{path}: no checkpoint of kpbench train, expected schema {SCHEMA!r} inside")
     return content, tensors
