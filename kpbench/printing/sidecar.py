@@ -36,6 +36,7 @@ def sidecar_head(
         "digest": digest,
         "page_mm": [page_format.width_mm, page_format.height_mm],
         "mirrored": page_format.mirrored,
+        "inverted": page_format.inverted,
         "ruler_mm": list(page_format.rulers_mm),
         "print_scale": [1.0, 1.0],
         "patches": [{"id": p.patch_id, "name": p.name, "digest": p.digest} for p in patches],

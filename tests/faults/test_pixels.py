@@ -1,6 +1,7 @@
 """Pictures of more than 8 bits, transparent ones and rotated ones are read by one rule, and changes are said."""
 
 import io
+import json
 import struct
 import warnings
 import zlib
@@ -11,6 +12,7 @@ import pytest
 from helpers import kpbench
 from PIL import Image
 
+from kpbench.detectors.interface import load_detector
 from kpbench.images import decode_photo, open_images
 from kpbench.pixels import bits_used, decode_pixels
 from kpbench.predictions.coco import CocoDataset
@@ -162,3 +164,50 @@ def test_backgrounds_follow_the_same_rule_in_silence(tmp_path):
 )
 def test_no_picture_is_none(data):
     assert decode_pixels(np.frombuffer(data, np.uint8), 3, True) is None
+
+
+# --- Inverted prints -----------------------------------------------------------------------------------------------
+
+
+def printed(here, *options):
+    """The printed page and the sidecar of the four shipped designs."""
+    kpbench("render-patches", "--png", "--dpi", "150", "--no-labels", "--out", "print", *options)
+    return cv2.imread("print/patches.png", cv2.IMREAD_GRAYSCALE), json.loads((here / "print/patches.json").read_text())
+
+
+@pytest.mark.parametrize(
+    "more", [[], ["--mirror"], ["--board", "grid"], ["--board", "hexagon", "--patch", "wheel"]], ids=str
+)
+def test_invert_swaps_black_and_white_within_the_patches_alone(here, more):
+    pages = {}
+    for options in ([], ["--invert"]):
+        kpbench("render-patches", "--png", "--dpi", "100", "--out", "print", *more, *options)
+        [name] = (here / "print").glob("*.json")
+        pages[bool(options)] = cv2.imread(str(name.with_suffix(".png")), 0).astype(int), json.loads(name.read_text())
+    (plain, sidecar), (inverted, other) = pages[False], pages[True]
+    assert (sidecar.pop("inverted"), other.pop("inverted")) == (False, True)
+    assert sidecar == other
+    y, x = np.mgrid[: plain.shape[0], : plain.shape[1]]
+    per_mm = sidecar["png"]["px_per_mm"]
+    inside, outside = np.zeros(plain.shape, bool), np.ones(plain.shape, bool)
+    for k in sidecar["keypoints"]:
+        distance = np.hypot(x + 0.5 - k["page_x_mm"] * per_mm, y + 0.5 - k["page_y_mm"] * per_mm)
+        inside |= distance < k["diameter_mm"] / 2 * per_mm - 2
+        outside &= distance > k["diameter_mm"] / 2 * per_mm + 2
+    assert inside.sum() > 1000
+    assert np.abs(plain + inverted - 255)[inside].max() <= 3
+    assert (plain == inverted)[outside].all()
+
+
+def test_an_inverted_print_of_the_four_designs_is_another_valid_print(here):
+    """So no detector can tell: checker and trefoil are their own inverses, turned; wheel and mushroom each other's."""
+    names = {}
+    for options in ([], ["--invert"]):
+        page, sidecar = printed(here, *options)
+        found = load_detector("template")(cv2.resize(page, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA))
+        per_mm = 0.3 * sidecar["png"]["px_per_mm"]
+        for k in sidecar["keypoints"]:
+            nearest = np.hypot(*(found.xy + 0.5 - np.array([k["page_x_mm"], k["page_y_mm"]]) * per_mm).T).argmin()
+            names.setdefault(k["patch_id"], []).append(int(found.patch_id[nearest]))
+            assert found.score[nearest] > 0.9
+    assert names == {0: [0, 0], 1: [1, 1], 2: [2, 3], 3: [3, 2]}
