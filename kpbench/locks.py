@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from kpbench.errors import DataError, KpbenchWarning
+from kpbench.errors import DataError, KpbenchWarning, system_reason
 from kpbench.files import is_local
 
 LOCK_FILE = ".kpbench.lock"
@@ -43,7 +43,7 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
     try:
         file = open(os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), "r+b")  # noqa: SIM115
     except OSError as error:
-        reason = "it is a symbolic link" if error.errno == errno.ELOOP else error.strerror
+        reason = "it is a symbolic link" if error.errno == errno.ELOOP else system_reason(error) or error
         raise DataError(f"{path}: cannot be written, {reason}") from None
     with file:
         try:

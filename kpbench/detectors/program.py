@@ -30,7 +30,7 @@ def _run(words: Sequence[str], stderr: Path) -> tuple[int, str]:
                 words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True
             )
         except (OSError, ValueError) as error:
-            raise DataError(f"{words[0]}: cannot be started, {getattr(error, 'strerror', error)}") from None
+            raise DataError(f"{words[0]}: cannot be started, {system_reason(error) or error}") from None
         try:
             code = program.wait()
         except BaseException:
