@@ -212,7 +212,7 @@ class Dataset:
         manifest = self.path / MANIFEST
         expected = {"version": 1, "seed": self.config.get("seed"), "images": len(self)}
         for name, value in expected.items():
-            if name not in self._manifest or canonical_json(self._manifest[name]) != canonical_json(value):
+            if canonical_json(self._manifest.get(name)) != canonical_json(value):
                 found = repr(self._manifest[name])[:60] if name in self._manifest else "missing"
                 raise DataError(f"{manifest}: {name} is {found}, expected {value!r}")
         for name in sorted(

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError, system_reason
 from kpbench.files import is_local, note_read
+from kpbench.locks import open_with_lock_if_possible
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
@@ -208,8 +209,7 @@ def open_shard(path: Path) -> Any:
     with shard_errors(path):
         if is_local(path):
             note_read(path)
-        # Shards appear whole under their names, so reading needs no lock, which some file systems do not have
-        file = h5py.File(path, "r", locking=False) if is_local(path) else h5py.File(path.open("rb"), "r")
+        file = open_with_lock_if_possible(h5py.File, path) if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
         with shard_errors(path):
             _check_shard(file, path.stat().st_size)

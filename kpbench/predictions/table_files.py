@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import KpbenchWarning, PredictionsError, system_reason
+from kpbench.locks import open_with_lock_if_possible
 from kpbench.predictions.decode import Place, abbreviate, parse_json
 from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
 from kpbench.types import Predictions, offsets_of
@@ -302,7 +303,7 @@ def read_h5(path: Path) -> Predictions:
 
     columns: dict[str, NDArray[Any]] = {}
     try:
-        with h5py.File(path, "r", locking=False) as file:
+        with open_with_lock_if_possible(h5py.File, path) as file:
             header = {}
             if "header" in file.attrs:
                 header = parse_header(parse_json(_to_bytes(file.attrs["header"]), "the attribute header"))

@@ -1,5 +1,6 @@
 """Machines unlike ours: no file locks, no file handles, no permission, another OpenCV. What is missing is named."""
 
+import io
 import json
 import os
 import resource
@@ -13,6 +14,7 @@ from importlib import metadata
 from pathlib import Path
 
 import cv2
+import h5py
 import numpy as np
 import pytest
 from helpers import kpbench, perfect_predictions, write_dataset
@@ -113,10 +115,6 @@ def test_a_refusal_of_the_system_is_named_with_the_path(files, name, number, rea
             raise OSError(number, os.strerror(number), str(opened))
         return original(opened, *more, **named)
 
-    import io
-
-    import h5py
-
     for module, attribute in ((io, "open"), (h5py, "File"), (np, "fromfile")):
         original = getattr(module, attribute)
         if module is h5py and not name.endswith("h5"):
@@ -179,6 +177,16 @@ def test_without_file_locks_shards_are_read_and_written(tmp_path, nolock, number
     else:
         assert done.stdout == "1\n", done.stderr
         assert done.stderr.count(said) == 1
+
+
+def test_a_file_that_the_user_has_open_is_read_beside(files):
+    with h5py.File(files / "set" / "shard-00000.h5"), h5py.File(files / "p.h5"):
+        assert open_dataset(files / "set").image(0).shape == (8, 8)
+        assert len(read_predictions(files / "p.h5")) == 1
+    data = open_dataset(files / "set")
+    data.image(0)
+    with h5py.File(files / "set" / "shard-00000.h5") as file:
+        assert len(file["images"]) == 1
 
 
 # --- Versions ------------------------------------------------------------------------------------------------------
