@@ -29,6 +29,7 @@ from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
 from kpbench.files import make_folder, require_own_folder
 from kpbench.locks import lock_folder
+from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.patches.design import shipped_patches
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.report.paper import PAPER
@@ -200,7 +201,9 @@ def _run_bench(
             if file.exists():
                 progress(len(dataset))
             else:
-                parts += _plan_parts(dataset, name, {"name": detector.name, "version": detector.version}, file)
+                about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
+                parts += _plan_parts(dataset, name, about, file)
+    warn_of_opencv()
     _detect_parts(parts, workers, progress)
     for _, _, file in runs:
         if not file.exists():

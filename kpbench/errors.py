@@ -13,6 +13,17 @@ A user of the library catches ``KpbenchError``. The command line prints the mess
 
 from __future__ import annotations
 
+import errno
+import os
+
+REASONS = {
+    errno.EMFILE: "too many files are open; raise the limit with `ulimit -n`",
+    errno.ENFILE: "too many files are open on this machine",
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk is full (quota)",
+    errno.ELOOP: "it is a symbolic link in a circle",
+}
+"""Errors of the system that are named in words of our own."""
 LONGEST_MESSAGE = 800
 """Characters. Of a longer message, the middle is left out."""
 
@@ -66,3 +77,13 @@ class PredictionsError(KpbenchError):
 
 class GateFailed(KpbenchError):
     """A score misses a limit that the caller set."""
+
+
+def system_reason(error: BaseException) -> str | None:
+    """Return why the system refused a file, such as "Permission denied"; None if the error is not the system's.
+
+    h5py raises OSError both for a damaged file and for a file that the system refuses. Only the latter has a number.
+    """
+    if not isinstance(error, OSError) or not error.errno:
+        return None
+    return REASONS.get(error.errno) or os.strerror(error.errno)

@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 
-from kpbench.errors import DataError, KpbenchError
+from kpbench.errors import DataError, KpbenchError, system_reason
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 
@@ -82,9 +82,24 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     try:
         return Path(path).read_text("utf-8")
     except OSError as problem:
-        raise error(f"{path}: cannot be read, {problem.strerror}") from None
+        raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: cannot be read, not UTF-8 text") from None
+
+
+def require_readable(path: Path, error: type[KpbenchError] = DataError) -> None:
+    """Note that a file is read, and refuse a file that cannot be opened, for libraries that do not say why.
+
+    Raises
+    ------
+    error
+        If the file cannot be opened. The message names the file and the reason.
+    """
+    note_read(path)
+    try:
+        path.open("rb").close()
+    except OSError as problem:
+        raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
 
 
 def sha256_of(path: Path) -> str:
@@ -99,7 +114,7 @@ def sha256_of(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
+        raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
 
 
 def folder_at(place: str | Path) -> Path:
@@ -194,5 +209,5 @@ def make_folder(folder: Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(f"{folder}: cannot be made, {error.strerror}") from None
+        raise DataError(f"{folder}: cannot be made, {system_reason(error) or error}") from None
     return folder

@@ -5,25 +5,28 @@ Images are uint8, grey (H, W) or RGB (H, W, 3).
 
 from __future__ import annotations
 
+import errno
 import secrets
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from kpbench.errors import DataError
-from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read
+from kpbench.errors import DataError, system_reason
+from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read, require_readable
+from kpbench.films import DEFAULT_FPS, VIDEO_SUFFIXES, Film, name_frames, open_animation, open_camera, open_video
+from kpbench.pixels import Notes, decode_pixels
 from kpbench.types import UInt8
 from kpbench.writing import move_file, require_writable, write_file
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
 DRAWING_SUFFIXES = (".png", ".jpg", ".jpeg")  # suffixes of an image file into which detections are drawn
-DEFAULT_FPS = 25.0  # frames per second of a video or camera that reports no frame rate
+UNDECODABLE = "cannot be decoded"
+"""Message about an image without pixels."""
 PNG_HEAD_BYTES = 33
 """Length of the signature and of the first chunk (IHDR) of a PNG file."""
 _SOFTWARE = b"tEXtSoftware\0kpbench.picture/1"
@@ -45,12 +48,32 @@ class ImageSource:
     length : int or None
         Number of images; None if unknown, as for a camera.
     fps : float or None
-        Frames per second of a video or camera; None for files.
+        Frames per second of a film or camera; None for files.
+    film : str
+        The film or camera whose frames the images are; "" for files.
+    problems : dict of str to str
+        Why an image has no pixels, by name, filled while ``images`` is read. A name that is not here could not be
+        decoded.
     """
 
     images: Iterator[tuple[str, UInt8 | None]]
     length: int | None
     fps: float | None = None
+    film: str = ""
+    problems: dict[str, str] = field(default_factory=dict)
+
+    def describe_failures(self, failures: Sequence[tuple[str, str]]) -> list[str]:
+        """Return failures, each a name and a message, in lines; one line for all frames with the same message."""
+        if not self.film:
+            return [f"{name}: {message}" for name, message in failures]
+        frames: dict[str, list[int]] = {}
+        for name, message in failures:
+            frames.setdefault(message, []).append(int(Path(name).stem))
+        lines = []
+        for message, numbers in frames.items():
+            problem = " cannot be read" if message == UNDECODABLE else f": {message}"
+            lines.append(f"{self.film}: {name_frames(numbers, self.length)}{problem}")
+        return lines
 
 
 def open_images(source: str, exclude: Path | None = None) -> ImageSource:
@@ -69,21 +92,23 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         number = source.removeprefix("camera:")
         if not number.isdecimal():
             raise DataError(f"{source}: expected camera:0, camera:1, …")
-        return _open_video(cv2.VideoCapture(int(number)), source, None)
+        return _source_of(open_camera(int(number)), source)
     if path.is_dir():
         files = image_files(path, exclude)
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
-        return ImageSource(((name, _decode(path / name)) for name in files), len(files))
+        problems: dict[str, str] = {}
+        return ImageSource(_read_folder(path, files, problems), len(files), problems=problems)
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        note_read(path)
-        capture = cv2.VideoCapture(str(path))
-        return _open_video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-    image = _decode(path)
-    if image is None:
-        raise DataError(f"{path}: cannot be decoded as an image")
+        require_readable(path)
+        return _source_of(open_video(path), source)
+    image = _read_image(path, Notes())
+    if isinstance(image, Film):
+        return _source_of(image, source)
+    if isinstance(image, str):
+        raise DataError(f"{path}: {image}{' as an image' if image == UNDECODABLE else ''}")
     return ImageSource(iter([(path.name, image)]), 1)
 
 
@@ -100,41 +125,49 @@ def refuse_same_folder(source: str | Path, target: Path) -> None:
         raise DataError(f"{target}: holds the images themselves, which would be overwritten; name another place")
 
 
-def _decode(path: Path) -> UInt8 | None:
+def _read_folder(folder: Path, names: Sequence[str], problems: dict[str, str]) -> Iterator[tuple[str, UInt8 | None]]:
+    notes = Notes()
+    for name in names:
+        found = _read_image(folder / name, notes)
+        if isinstance(found, Film):
+            notes.warn(folder / name, "is a film, of which only the first frame is read; name the file to read it all")
+            yield name, next(found.frames)
+        elif isinstance(found, str):
+            problems[name] = found
+            yield name, None
+        else:
+            yield name, found
+
+
+def _read_image(path: Path, notes: Notes | None) -> UInt8 | Film | str:
+    """Return the pixels of an image file, or the film that it is, or why it cannot be read."""
     note_read(path)
     try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):
-        return None
-    return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+        data = np.fromfile(path, np.uint8)
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):  # no later file could be read either
+            raise DataError(f"{path}: cannot be read, {system_reason(error)}") from None
+        return f"cannot be read, {system_reason(error) or error}"
+    film = open_animation(path, data)
+    if film is not None:
+        return film
+    image = decode_pixels(data, 3, rotate=True, name=path, notes=notes)
+    return UNDECODABLE if image is None else image
 
 
-def _open_video(capture: cv2.VideoCapture, name: str, length: int | None) -> ImageSource:
-    if not capture.isOpened():
-        raise DataError(f"{name}: cannot be opened as a video")
-
-    def frames() -> Iterator[tuple[str, UInt8 | None]]:
-        number = 0
-        while True:
-            good, frame = capture.read()
-            if not good:
-                capture.release()
-                return
-            yield f"{number:08d}.png", np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
-            number += 1
-
-    known_length = length if length and length > 0 else None
-    return ImageSource(frames(), known_length, capture.get(cv2.CAP_PROP_FPS) or DEFAULT_FPS)
+def _source_of(film: Film, name: str) -> ImageSource:
+    frames = ((f"{number:08d}.png", frame) for number, frame in enumerate(film.frames))
+    return ImageSource(frames, film.length, film.fps, name)
 
 
 @contextmanager
 def image_writer(
     target: Path | None, count: int | None, fps: float | None = None
-) -> Iterator[Callable[[str, UInt8], None]]:
+) -> Iterator[Callable[[str, UInt8 | None], None]]:
     """Yield a function that writes RGB images under their names.
 
     The target decides the form: a folder of PNG files, one video (.mp4), or one image (.png, .jpg). With no target,
-    nothing is written.
+    nothing is written. An image may be None: a video gets a black frame, so that later frames keep their places.
 
     Parameters
     ----------
@@ -162,7 +195,9 @@ def image_writer(
             yield write_frame
         return
 
-    def write_drawing(name: str, image: UInt8) -> None:
+    def write_drawing(name: str, image: UInt8 | None) -> None:
+        if image is None:
+            return
         path = target if to_file else target / (name if name.endswith(".png") else f"{name}.png")
         make_folder(path.parent)
         # cv2.imwrite leaves half a file on a full disk, and ends the process if a name is not UTF-8
@@ -172,7 +207,7 @@ def image_writer(
 
 
 @contextmanager
-def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], None]]:
+def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8 | None], None]]:
     """Yield a function that appends a frame to a video. The video is written whole or not at all.
 
     OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
@@ -181,10 +216,13 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
     part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
     sizes = set[tuple[int, int]]()
-    written = 0
+    written = black = 0
 
-    def write_frame(name: str, image: UInt8) -> None:
-        nonlocal written
+    def write_frame(name: str, image: UInt8 | None) -> None:
+        nonlocal written, black
+        if image is None:
+            black += 1  # written before the next image, whose size it has
+            return
         size = (image.shape[1], image.shape[0])
         sizes.add(size)
         if len(sizes) > 1:  # OpenCV would silently drop the frame
@@ -193,8 +231,9 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
             video.append(cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), fps, size))
             if not video[0].isOpened():
                 raise DataError(f"{target}: cannot be written as a video, expected a name ending in .mp4")
-        video[0].write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        written += 1
+        for frame in [np.zeros_like(image)] * black + [image]:
+            video[0].write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+        written, black = written + black + 1, 0
 
     try:
         yield write_frame
@@ -242,20 +281,26 @@ def to_grey(image: UInt8) -> UInt8:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
+def read_rgb(path: Path) -> UInt8 | None:
+    """Return an image as RGB, rotated by its EXIF data, as :func:`open_images` reads it; None if it cannot be read."""
+    image = _read_image(path, None)
+    if isinstance(image, Film):
+        return next(image.frames)
+    return None if isinstance(image, str) else image
+
+
 def decode_photo(path: Path, channels: int) -> UInt8 | None:
     """Return a photograph as grey (``channels`` 1) or RGB (``channels`` 3), not rotated by its EXIF data.
 
     Return None if the file cannot be decoded, or the image has a side under 8 px.
     """
-    flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
     try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
+        image = decode_pixels(np.fromfile(path, np.uint8), channels, rotate=False)
+    except OSError as error:
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            raise DataError(f"{path}: cannot be read, {system_reason(error)}") from None
         return None
-    if image is None or min(image.shape[:2]) < 8:
-        return None
-    return np.asarray(image if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return None if image is None or min(image.shape[:2]) < 8 else image
 
 
 def encode_png(image: UInt8) -> bytes:

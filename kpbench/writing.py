@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.files import is_local, is_read
 
 MARK = re.compile(rb"kpbench\.([a-z-]+)/\d")
@@ -142,7 +142,7 @@ def remove_file(path: Path, kind: str) -> None:
             raise DataError(f"{path}: would be removed, but kpbench did not write it; move it elsewhere")
         path.unlink(missing_ok=True)
     except OSError as error:
-        raise DataError(f"{path}: cannot be removed, {error.strerror}") from None
+        raise DataError(f"{path}: cannot be removed, {system_reason(error) or error}") from None
 
 
 def remove_leftovers(paths: Iterable[Path]) -> None:
@@ -208,8 +208,7 @@ def _one_line_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        reason = "the disk is full" if error.errno in (errno.ENOSPC, errno.EDQUOT) else error.strerror
-        raise DataError(f"{path}: cannot be written, {reason}") from None
+        raise DataError(f"{path}: cannot be written, {system_reason(error) or error}") from None
 
 
 @contextmanager

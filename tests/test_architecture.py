@@ -32,9 +32,12 @@ GROUND = {
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],
     "signals": [],
-    "images": ["errors", "types", "files", "writing"],
+    "pixels": ["errors", "types"],
+    "films": ["errors", "types", "pixels"],
+    "images": ["errors", "types", "files", "writing", "pixels", "films"],
     "workers": ["errors", "signals"],
     "seeds": [],
+    "opencv": ["errors"],
 }
 """What every stage shares, and what each of these modules may import."""
 ROOMS = {

@@ -9,12 +9,13 @@ import sys
 import warnings
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import click
 
 from kpbench import __version__
-from kpbench.errors import KpbenchError, KpbenchWarning
+from kpbench.errors import KpbenchError, KpbenchWarning, system_reason
 
 # The module of a command is imported when the command is run: `kpbench --help` must not wait for OpenCV, HDF5 or torch.
 # Each entry holds the module and function of a command, and the description of the command in `kpbench --help`.
@@ -74,7 +75,8 @@ class LazyGroup(click.Group):
             raise clean_usage_error(error) from None
         except OSError as error:  # usually of standard output: an unwritable file raises KpbenchError
             if not isinstance(error, BrokenPipeError):  # the reader closed the pipe: no message needed
-                echo(f"kpbench: {error.strerror or error}", err=True)
+                place = f"{error.filename}: " if isinstance(error.filename, (str, Path)) else ""
+                echo(f"kpbench: {place}{system_reason(error) or error}", err=True)
             # without a replacement, Python would write to the broken stdout at exit, and exit with code 120
             with contextlib.suppress(OSError, ValueError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

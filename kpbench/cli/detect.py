@@ -87,7 +87,9 @@ def detect(
     write_predictions(out, run.predictions)
     echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
     if run.failures:
-        for label, problem in run.failures[:5]:
-            print_warning(f"{label}: {problem}")
+        pairs = [f"{label}: {problem}" for label, problem in run.failures]
+        lines = images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs
+        for line in lines[:5]:
+            print_warning(line)
         print_warning(f"{len(run.failures)} images failed and count as images without detections")
         raise SystemExit(1)

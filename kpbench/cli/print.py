@@ -57,6 +57,11 @@ if TYPE_CHECKING:
     help="Number of copies of each patch to cut out.",
 )
 @click.option("--mirror", is_flag=True, help="Swap left and right, for transfer film.")
+@click.option(
+    "--invert",
+    is_flag=True,
+    help="Swap black and white within each patch, for engraving and film that invert the print.",
+)
 @click.option("--no-labels", is_flag=True, help="Print no text. Rulers and cut marks stay.")
 @click.option(
     "--measured",
@@ -81,6 +86,7 @@ def render_patches(
     chosen: tuple[str, ...],
     copies: int,
     mirror: bool,
+    invert: bool,
     no_labels: bool,
     measured: tuple[float, float] | None,
 ) -> None:
@@ -115,7 +121,7 @@ def render_patches(
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
     boards = _boards(board, patches, bool(designs), diameter_mm) if board is not None else ()
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
-    layout: dict[str, Any] = {"page": parse_page_format(page, landscape, not no_labels, mirror), "dpi": dpi}
+    layout: dict[str, Any] = {"page": parse_page_format(page, landscape, not no_labels, mirror, invert), "dpi": dpi}
     with progress_bar(len(boards) or 1, "print", unit="sheet", shown=png) as progress:
         layout |= {"formats": wanted, "progress": progress}
         if board is not None:

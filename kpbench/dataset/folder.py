@@ -14,14 +14,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import DATASET_SCHEMA, canonical_json, encode_utf8, open_shard, shard_errors
-from kpbench.errors import DataError
+from kpbench.dataset.shard import (
+    DATASET_SCHEMA,
+    canonical_json,
+    encode_utf8,
+    open_shard,
+    read_text_attribute,
+    shard_errors,
+)
+from kpbench.errors import DataError, system_reason
 from kpbench.files import folder_at, is_local, note_read, sha256_of
 from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
 
 MANIFEST = "dataset.json"
+LARGEST_NUMBER = 2**53
+"""Every number of a manifest is smaller; other languages read larger ones inexactly."""
 MOST_OPEN_SHARDS = 128
 """Largest number of shards that a dataset keeps open. Many systems allow a process 256 open files."""
 
@@ -117,6 +126,7 @@ class Dataset:
 
     def __init__(self, path: Path, manifest: Mapping[str, Any]) -> None:
         self.path = path
+        self._manifest = dict(manifest)
         self.config: dict[str, Any] = manifest["config"]
         self.fingerprint: str = manifest["fingerprint"]
         self.provenance: dict[str, Any] = manifest.get("provenance", {})
@@ -190,23 +200,52 @@ class Dataset:
         return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]), fingerprint=self.fingerprint)
 
     def verify(self) -> Iterator[ShardEntry]:
-        """Check every shard against the manifest. Yield each undamaged shard after its check.
+        """Check every field of the manifest and every byte of the shards. Yield each shard after its check.
+
+        The versions and broken backgrounds of ``provenance`` cannot be recomputed; only their types are checked.
 
         Raises
         ------
         DataError
-            If the manifest's fingerprint is wrong. At the first shard that is missing, differs in a byte, or cannot be
-            read.
+            At the first field that does not fit the shards, or the first shard that is missing, differs in a byte, or
+            cannot be read.
         """
+        manifest = self.path / MANIFEST
+        expected = {"version": 1, "seed": self.config.get("seed"), "images": len(self)}
+        for name, value in expected.items():
+            if canonical_json(self._manifest.get(name)) != canonical_json(value):
+                found = repr(self._manifest[name])[:60] if name in self._manifest else "missing"
+                raise DataError(f"{manifest}: {name} is {found}, expected {value!r}")
+        for name in sorted(
+            self._manifest.keys() - {*expected, "schema", "fingerprint", "config", "shards", "provenance"}
+        ):
+            raise DataError(f"{manifest}: unknown key {name[:60]!r}")
+        if not _is_provenance(self.provenance):
+            raise DataError(f"{manifest}: provenance is no object with versions and broken_backgrounds")
         if compute_fingerprint(self.config, self.shards) != self.fingerprint:
-            raise DataError(f"{self.path / MANIFEST}: its fingerprint does not fit its config and shards")
+            raise DataError(f"{manifest}: its fingerprint does not fit its config and shards")
         for shard in self.shards:
             path = self.path / shard.file
             digest = sha256_of(path)
             if digest != shard.sha256:
                 raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
-            open_shard(path).close()
+            with open_shard(path) as file, shard_errors(path):
+                count, config = len(file["images"]), read_text_attribute(file, "config")
+            if count != shard.count:
+                raise DataError(f"{manifest}: {shard.file} has count {shard.count}, expected {count}")
+            if config.encode() != encode_utf8(canonical_json(self.config)):
+                raise DataError(f"{manifest}: config is not that of {shard.file}")
             yield shard
+
+
+def _is_provenance(content: object) -> bool:
+    """Return whether the types of a manifest's provenance are right; {} and absent parts are allowed."""
+    if not isinstance(content, dict):
+        return False
+    versions, broken = content.get("versions", {}), content.get("broken_backgrounds", [])
+    if not isinstance(versions, dict) or not isinstance(broken, list):
+        return False
+    return all(isinstance(text, str) for text in [*versions.values(), *broken])
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -241,8 +280,10 @@ def open_dataset(path: str | Path) -> Dataset:
             raise DataError(f"{folder / MANIFEST}: shard {shard.file!r} is not a plain file name")
         try:
             size = (folder / shard.file).stat().st_size
-        except OSError:
+        except FileNotFoundError:
             raise DataError(f"{folder / shard.file}: missing, listed in {MANIFEST}") from None
+        except OSError as error:
+            raise DataError(f"{folder / shard.file}: cannot be read, {system_reason(error) or error}") from None
         if size != shard.bytes:
             raise DataError(f"{folder / shard.file}: damaged, has {size} bytes, expected {shard.bytes}")
     return dataset
@@ -257,7 +298,8 @@ def _read_manifest(folder: Path) -> Dataset:
         content = json.loads(manifest.read_text("utf-8"))
         if content["schema"] != DATASET_SCHEMA:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
-        return Dataset(folder, content)
+        shards = [ShardEntry(**entry) for entry in content["shards"]]
+        fault = _find_fault(content["config"], content["fingerprint"], shards)
     except FileNotFoundError:
         if any(folder.glob("shard-*.h5")):
             raise DataError(f"{folder}: an unfinished dataset (no {MANIFEST}); resume the run that makes it") from None
@@ -265,7 +307,37 @@ def _read_manifest(folder: Path) -> Dataset:
     except NotADirectoryError:
         raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
-        raise DataError(f"{manifest}: cannot be read, {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+        raise DataError(f"{manifest}: cannot be read, {system_reason(error) or error}") from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
         expected = "JSON with schema, config, fingerprint and shards"
         raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None
+    if fault:
+        raise DataError(f"{manifest}: {fault}")
+    return Dataset(folder, content)
+
+
+def _find_fault(config: object, fingerprint: object, shards: Sequence[ShardEntry]) -> str | None:
+    """Return the first field of a manifest whose type or value is impossible, or None."""
+    if not isinstance(config, dict):
+        return "config is no object"
+    if not isinstance(fingerprint, str):
+        return "fingerprint is no text"
+    first, files = 0, set[str]()
+    for n, shard in enumerate(shards):
+        for name, value in vars(shard).items():
+            is_text = name in ("file", "sha256")
+            if is_text and not isinstance(value, str):
+                return f"shards[{n}]: {name} is {repr(value)[:40]}, expected a text"
+            if not is_text and (type(value) is not int or not 0 <= value < LARGEST_NUMBER):
+                return f"shards[{n}]: {name} is {repr(value)[:40]}, expected a whole number of 0 or more"
+        if Path(shard.file).name != shard.file or not shard.file.isprintable():
+            return f"shard {shard.file[:80]!r} is not a plain file name"
+        if shard.file in files:
+            return f"shards[{n}]: {shard.file} is listed twice"
+        if shard.first != first:
+            return f"shards[{n}]: first is {shard.first}, expected {first}"
+        if not shard.count:
+            return f"shards[{n}]: count is 0, expected 1 or more"
+        first += shard.count
+        files.add(shard.file)
+    return None

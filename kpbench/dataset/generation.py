@@ -39,6 +39,7 @@ from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, make_folder
 from kpbench.locks import lock_folder
+from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.workers import Progress, dask_executor, run_jobs
 from kpbench.writing import remove_leftovers, write_file
 
@@ -286,6 +287,7 @@ def _remove_leftovers_at_end(run: _Run) -> Iterator[None]:
 
 def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str, FinishedShard]:
     """Make the planned shards that are not kept. Return all planned shards by their file names."""
+    warn_of_opencv()
     missing = [shard for shard in run.plan if shard.file not in kept]
     # shards of the same scenes follow each other, so that cached backgrounds are used again
     missing.sort(key=lambda shard: run.config.scene_id(shard.first))
@@ -346,6 +348,7 @@ def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:
         "versions": {
             "python": platform.python_version(),
             **{name: metadata.version(name) for name in libraries},
+            "cv2": opencv_version(),  # that of another package, if several install OpenCV
         },
         "broken_backgrounds": list(broken_files),
     }

@@ -18,8 +18,9 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.files import is_local, note_read
+from kpbench.locks import open_with_lock_if_possible
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
@@ -182,6 +183,8 @@ def shard_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
+        if reason := system_reason(error):
+            raise DataError(f"{path}: cannot be read, {reason}") from None
         raise DataError(f"{path}: damaged or no kpbench shard ({' '.join(str(error).split())[:160]})") from None
 
 
@@ -206,7 +209,7 @@ def open_shard(path: Path) -> Any:
     with shard_errors(path):
         if is_local(path):
             note_read(path)
-        file = h5py.File(path, "r", locking="best-effort") if is_local(path) else h5py.File(path.open("rb"), "r")
+        file = open_with_lock_if_possible(h5py.File, path) if is_local(path) else h5py.File(path.open("rb"), "r")
     try:
         with shard_errors(path):
             _check_shard(file, path.stat().st_size)

@@ -11,7 +11,7 @@ from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import apply_effects, draw_effect
 from kpbench.errors import DataError
 from kpbench.files import make_folder
-from kpbench.images import ImageSource, encode_png, open_images, refuse_same_folder
+from kpbench.images import UNDECODABLE, ImageSource, encode_png, open_images, refuse_same_folder
 from kpbench.seeds import stream
 from kpbench.types import UInt8
 from kpbench.writing import write_file
@@ -74,7 +74,7 @@ def degrade_files(
     Raises
     ------
     DataError
-        If an effect is unknown, a level is out of bounds, or a file cannot be written. If an image cannot be decoded,
+        If an effect is unknown, a level is out of bounds, or a file cannot be written. If an image cannot be read,
         the error is raised after all other images are written.
 
     Examples
@@ -87,10 +87,10 @@ def degrade_files(
     ...     print(path, effects)
     degraded/wall.png [{'effect': 'blur', 'kernel_px': 7}]
     """
-    broken = []
+    broken: list[tuple[str, str]] = []
     for n, (name, image) in enumerate(source.images):
         if image is None:
-            broken.append(name)
+            broken.append((name, source.problems.get(name, UNDECODABLE)))
             continue
         image = _as_grey_if_colourless(image)
         rng = stream(seed, n, 0)
@@ -101,7 +101,8 @@ def degrade_files(
         write_file(target, encode_png(image))
         yield target, effects
     if broken:
-        raise DataError(f"{len(broken)} images cannot be decoded, the others are done: {', '.join(broken[:5])}")
+        lines = source.describe_failures(broken)
+        raise DataError(f"{len(broken)} images cannot be read, the others are done: {'; '.join(lines[:5])}")
 
 
 def _as_grey_if_colourless(image: UInt8) -> UInt8:

@@ -21,6 +21,7 @@ import numpy as np
 from kpbench import __version__
 from kpbench.detectors.program import run_program
 from kpbench.errors import DataError
+from kpbench.opencv import opencv_version
 from kpbench.patches.design import Patch
 from kpbench.types import Detections, UInt8
 
@@ -74,8 +75,8 @@ class LoadedDetector:
         Board of tags that the detector looks for, see :data:`kpbench.patches.TAG_BOARDS`. None: the detector looks for
         patches or for points without identity.
     identity : str, optional
-        SHA-256 of name, version, settings and weights. Stored detections stay valid while the identity is unchanged.
-        None if the detector has no version, or was loaded with ``patches``.
+        SHA-256 of name, version, OpenCV's version, settings and weights. Stored detections stay valid while the
+        identity is unchanged. None if the detector has no version, or was loaded with ``patches``.
     run_many : callable, optional
         Function of a sequence of images, for a detector that takes less time per image if it gets several images.
 
@@ -190,10 +191,13 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
 
 
 def _digest_detector(name: str, version: str, detector: Any) -> str:
-    """Return the SHA-256 of name, version, settings (plain public attributes) and weights (the file at ``path``)."""
+    """Return the SHA-256 of name, version, OpenCV's version, settings and weights.
+
+    Settings are plain public attributes. Weights are the file at the attribute ``path``.
+    """
     values = vars(detector) if hasattr(detector, "__dict__") else {}
     plain = {key: value for key, value in values.items() if key[0] != "_" and _is_plain(value)}
-    digest = hashlib.sha256(repr([name, version, sorted(plain.items())]).encode())
+    digest = hashlib.sha256(repr([name, version, opencv_version(), sorted(plain.items())]).encode())
     weights = getattr(detector, "path", None)
     if isinstance(weights, Path) and weights.is_file():
         digest.update(weights.read_bytes())

@@ -15,7 +15,8 @@ from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detector
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
-from kpbench.images import ImageSource, image_writer
+from kpbench.images import UNDECODABLE, ImageSource, image_writer
+from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
@@ -96,6 +97,7 @@ def predict(
     if isinstance(source, ImageSource):
         return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress)
     dataset = source
+    warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     if not isinstance(detector, str):
         workers = 1
@@ -151,18 +153,19 @@ def predict_images(
     >>> predict_images(ImageSource(images, 2), "template").failures
     (('broken.png', 'cannot be decoded'),)
     """
+    warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[ImageResult](), list[str]()
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
     with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
-            result = (Detections.none(), "cannot be decoded")
-            if image is not None:
+            if image is None:
+                result = (Detections.none(), source.problems.get(label, UNDECODABLE))
+            else:
                 result = _detect(loaded, image, threshold)
             found.append(result)
             labels.append(label)
-            if image is not None:
-                draw(label, draw_detections(image, result[0]))
+            draw(label, None if image is None else draw_detections(image, result[0]))
             progress(1)
     return _collect(loaded, found, labels, np.arange(len(found)))
 
@@ -174,7 +177,7 @@ def _collect(
         raise DataError(
             f"detector {detector.name}: failed on all {len(found)} images, first {labels[0]}: {found[0][1]}"
         )
-    about = {"name": detector.name, "version": detector.version}
+    about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
     of_dataset = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
     predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
     failures = tuple((label, message) for label, (_, message) in zip(labels, found, strict=True) if message)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import cv2
 
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
 
@@ -30,7 +30,7 @@ def _run(words: Sequence[str], stderr: Path) -> tuple[int, str]:
                 words, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=file, start_new_session=True
             )
         except (OSError, ValueError) as error:
-            raise DataError(f"{words[0]}: cannot be started, {getattr(error, 'strerror', error)}") from None
+            raise DataError(f"{words[0]}: cannot be started, {system_reason(error) or error}") from None
         try:
             code = program.wait()
         except BaseException:

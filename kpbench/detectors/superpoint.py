@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kpbench.detectors.inference import open_session, runs_on_gpu
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.files import note_read
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
@@ -261,7 +261,9 @@ class SuperPointDetector:
         except DataError:
             raise
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
-            raise DataError(f"{self.path}: cannot be read as an ONNX model ({_first_line(error)})") from None
+            raise DataError(
+                f"{self.path}: cannot be read as an ONNX model ({system_reason(error) or _first_line(error)})"
+            ) from None
         if not isinstance(content, dict) or content.get("schema") != SCHEMA:
             raise DataError(f"{self.path}: not written by kpbench export-model, expected schema {SCHEMA!r} inside")
         self.content: dict[str, Any] = content

@@ -158,6 +158,12 @@ class Patch:
         """Exact outline of all black ink, without seams: black cells that share a border are merged."""
         return trace_contours(*self.cells)
 
+    @cached_property
+    def white_region(self) -> Region:
+        """Exact outline of all that is not black within rim and quiet zone: the ink of an inverted print."""
+        radii, angles, black = self.cells
+        return trace_contours(radii, angles, ~black)
+
     @property
     def disc_region(self) -> Region:
         """Exact outline of the patch, rim and quiet zone included."""

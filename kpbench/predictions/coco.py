@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
@@ -14,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.errors import DataError, PredictionsError
+from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
 from kpbench.files import note_read, path_below
 from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
 from kpbench.predictions.table_files import build_predictions
@@ -23,6 +24,8 @@ from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
 Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]
 """ID of a category: the patch ID plus 1."""
+IMAGES_LOOKED_AT = 20
+"""Number of images whose files are compared with the width and height that the annotations state."""
 Point = tuple[float, float, float]
 """Place x, y in px, and COCO's visibility v; v = 0 means "not labelled"."""
 
@@ -32,6 +35,8 @@ class CocoImage(msgspec.Struct, gc=False):
 
     id: Whole
     file_name: str = ""
+    width: float | None = None
+    height: float | None = None
     condition: str = ""
     rung: float | None = None
     scene_id: Whole | None = None
@@ -78,6 +83,7 @@ EXPECTED_IN_COCO = {
     "category_id": "a whole number from 1",
     "condition": "a text",
     "file_name": "a text",
+    "height": "a number of px",
     "id": "a whole number of 0 or more",
     "image_id": "a whole number of 0 or more",
     "keypoints": "one keypoint [x, y, v] of numbers",
@@ -88,6 +94,7 @@ EXPECTED_IN_COCO = {
     "scene_id": "a whole number of 0 or more",
     "score": "a finite number",
     "visible": "a fraction",
+    "width": "a number of px",
 }
 """The expected value of each field of the records above, in words."""
 
@@ -136,13 +143,12 @@ class CocoDataset:
         DataError
             If the image is missing or cannot be decoded, or the file does not lie below the folder of the annotations.
         """
-        import cv2
+        from kpbench.images import read_rgb  # here, as scores need no OpenCV
 
         for prefix in ("", "images/") if self.files[index] else ():
-            path = path_below(self.path.parent, prefix + self.files[index])
-            pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            pixels = read_rgb(path_below(self.path.parent, prefix + self.files[index]))
             if pixels is not None:
-                return np.asarray(pixels[..., ::-1], np.uint8)
+                return pixels
         raise DataError(f"{self.path.parent / self.files[index]}: no image there that can be decoded")
 
 
@@ -184,12 +190,38 @@ def open_coco(path: str | Path) -> CocoDataset:
             content = _decode_annotations(data)
             truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
             files = tuple(image.file_name for image in content.images)
+            _warn_of_orientation(path, content.images[:IMAGES_LOOKED_AT])
             del content  # freed before the garbage collector resumes and scans it
         return CocoDataset(path, truth, files)
     except OSError as error:
-        raise DataError(f"{path}: cannot be read, {error.strerror}") from None
+        raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
     except (DataError, PredictionsError) as error:
         raise DataError(f"{path}: {error}") from None
+
+
+def _warn_of_orientation(path: Path, images: Sequence[CocoImage]) -> None:
+    """Warn if an image stands upright in the annotations and lies on its side when it is read, or the reverse."""
+    for image in images:
+        if not image.file_name or not image.width or image.width == image.height:
+            continue
+        try:
+            files = [path_below(path.parent, prefix + image.file_name) for prefix in ("", "images/")]
+        except DataError:  # told when the image is read
+            continue
+        file = next((file for file in files if file.is_file()), None)
+        if file is None:
+            continue
+        from kpbench.pixels import read_size  # here, as scores need no OpenCV
+
+        size = read_size(file)
+        if size is not None and size == (image.height, image.width):
+            warnings.warn(
+                f"{path}: {image.file_name} is {image.width:g} x {image.height:g} there, but {size[0]} x {size[1]} "
+                "when it is read, as its EXIF data rotates it; the truth must be in that orientation",
+                KpbenchWarning,
+                stacklevel=3,
+            )
+            return
 
 
 def _decode_annotations(data: bytes) -> CocoAnnotations:
@@ -248,7 +280,8 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
         table[name] = _column(annotations, name)
     radius, major, minor = (_column(annotations, name) for name in ("radius", "radius_major", "radius_minor"))
     major = np.where(np.isnan(major), radius, major)
-    for n in np.flatnonzero(np.isnan(major)).tolist():
+    labelled = points[:, 2] > 0
+    for n in np.flatnonzero(np.isnan(major) & labelled).tolist():
         if annotations[n].radius is None and annotations[n].radius_major is None:
             raise DataError(
                 f"annotations[{n}] (image_id {annotations[n].image_id}): has no radius, "
@@ -256,13 +289,14 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
             )
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
+    valid |= ~labelled
     if not valid.all():
         n = int(np.argmin(valid))
         raise DataError(
             f"annotations[{n}] (image_id {annotations[n].image_id}): keypoints are {points[n].tolist()} and the radius "
             f"is {table['radius_major'][n]}, expected finite numbers"
         )
-    return table, points[:, 2] > 0
+    return table, labelled
 
 
 def _column(entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: type = np.float64) -> NDArray[Any]:

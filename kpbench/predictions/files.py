@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from kpbench.errors import PredictionsError
+from kpbench.errors import PredictionsError, system_reason
 from kpbench.files import note_read
 from kpbench.predictions import json_files, table_files
 from kpbench.predictions.decode import pause_gc
@@ -71,7 +71,7 @@ def read_predictions(path: str | Path) -> Predictions:
     except PredictionsError as error:
         raise PredictionsError(f"{path}: {error}") from None
     except OSError as error:
-        raise PredictionsError(f"{path}: cannot be read, {error.strerror or error}") from None
+        raise PredictionsError(f"{path}: cannot be read, {system_reason(error) or error}") from None
 
 
 def require_predictions_path(path: str | Path) -> Path:

@@ -42,6 +42,8 @@ class PageFormat:
         Whether text is printed. Rulers and cut marks are always printed.
     mirrored : bool
         Whether left and right are swapped, for transfer film.
+    inverted : bool
+        Whether black and white are swapped within each patch, for processes that invert the print.
 
     Examples
     --------
@@ -54,6 +56,7 @@ class PageFormat:
     height_mm: float
     labels: bool = True
     mirrored: bool = False
+    inverted: bool = False
 
     @property
     def ink_size_mm(self) -> tuple[float, float]:
@@ -76,7 +79,9 @@ class PageFormat:
         return mirror_page(page) if self.mirrored else page
 
 
-def parse_page_format(page: str, landscape: bool = False, labels: bool = True, mirrored: bool = False) -> PageFormat:
+def parse_page_format(
+    page: str, landscape: bool = False, labels: bool = True, mirrored: bool = False, inverted: bool = False
+) -> PageFormat:
     """Return the page format for a name or a size.
 
     Parameters
@@ -85,7 +90,7 @@ def parse_page_format(page: str, landscape: bool = False, labels: bool = True, m
         "a4", "a3", "a2", "letter", "legal", or width and height in mm such as "200x300mm".
     landscape : bool
         Whether to swap width and height.
-    labels, mirrored : bool
+    labels, mirrored, inverted : bool
         See :class:`PageFormat`.
 
     Raises
@@ -97,7 +102,7 @@ def parse_page_format(page: str, landscape: bool = False, labels: bool = True, m
     --------
     >>> from kpbench.printing import parse_page_format
     >>> parse_page_format("a4", landscape=True)
-    PageFormat(width_mm=297.0, height_mm=210.0, labels=True, mirrored=False)
+    PageFormat(width_mm=297.0, height_mm=210.0, labels=True, mirrored=False, inverted=False)
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)(?:mm)?", page.lower())
     if page.lower() not in PAGE_SIZES_MM and not match:
@@ -105,4 +110,4 @@ def parse_page_format(page: str, landscape: bool = False, labels: bool = True, m
     width, height = (float(match[1]), float(match[2])) if match else PAGE_SIZES_MM[page.lower()]
     if not (40 <= width <= 5000 and 40 <= height <= 5000):
         raise DesignError(f"`page` is {page!r}, {width:g} x {height:g} mm, expected 40 to 5000 mm a side")
-    return PageFormat(*((height, width) if landscape else (width, height)), labels, mirrored)
+    return PageFormat(*((height, width) if landscape else (width, height)), labels, mirrored, inverted)

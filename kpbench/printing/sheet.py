@@ -103,7 +103,10 @@ def patch_sheet(patches: Sequence[Patch], diameter_mm: float, page_format: PageF
         for n, patch in enumerate(prints[start : start + per_page]):
             x = page_format.width_mm / 2 + (n % columns + 0.5 - columns / 2) * cell_x
             y = PAGE_MARGIN + n // columns * cell_y + cell_x / 2
-            shapes += [_ink(patch, x, y, diameter_mm, 0.0), *disc_marks(x, y, patch.extent * diameter_mm / 2)]
+            shapes += [
+                _ink(patch, x, y, diameter_mm, 0.0, page_format),
+                *disc_marks(x, y, patch.extent * diameter_mm / 2),
+            ]
             texts.append(Text(labels[patch], x, y + cell_x / 2 + LABEL_HEIGHT / 2, label_size, "middle"))
             on_paper = page_format.position_on_paper(x, y)
             keypoints.append(sidecar_entry(len(keypoints), patch, 0.0, diameter_mm, number, on_paper))
@@ -187,7 +190,9 @@ def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], page_format: Pag
     shapes, texts = frame(page_format, title, foot)
     for k in board.keypoints:
         if tile.contains(k.x_mm, k.y_mm):
-            shapes.append(_ink(k.patch, *_on_page(tile, page_format, k.x_mm, k.y_mm), k.diameter_mm, k.rotate_deg))
+            shapes.append(
+                _ink(k.patch, *_on_page(tile, page_format, k.x_mm, k.y_mm), k.diameter_mm, k.rotate_deg, page_format)
+            )
     for x, y in tile.corners:
         page_x, page_y = _on_page(tile, page_format, x, y)
         right, down = (1 if x == tile.x1 else -1), (1 if y == tile.y1 else -1)
@@ -207,8 +212,9 @@ def _on_page(tile: Tile, page_format: PageFormat, x: float, y: float) -> tuple[f
     return x + (page_format.width_mm - tile.x0 - tile.x1) / 2, y + (page_format.height_mm - tile.y0 - tile.y1) / 2
 
 
-def _ink(patch: Patch, x: float, y: float, diameter: float, rotate_deg: float) -> Shape:
-    return Shape(move(patch.black_region, x, y, diameter / 2, rotate_deg), INK)
+def _ink(patch: Patch, x: float, y: float, diameter: float, rotate_deg: float, page_format: PageFormat) -> Shape:
+    region = patch.white_region if page_format.inverted else patch.black_region
+    return Shape(move(region, x, y, diameter / 2, rotate_deg), INK)
 
 
 def _round_down(diameter: float) -> str:

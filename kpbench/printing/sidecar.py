@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from kpbench import __version__
-from kpbench.errors import DesignError
+from kpbench.errors import DesignError, system_reason
 from kpbench.patches.design import Patch
 from kpbench.printing.page import round_to_nm
 from kpbench.printing.page_format import PageFormat
@@ -37,6 +37,7 @@ def sidecar_head(
         "digest": digest,
         "page_mm": [page_format.width_mm, page_format.height_mm],
         "mirrored": page_format.mirrored,
+        "inverted": page_format.inverted,
         "ruler_mm": list(page_format.rulers_mm),
         "print_scale": [1.0, 1.0],
         "patches": [{"id": p.patch_id, "name": p.name, "digest": p.digest} for p in patches],
@@ -88,7 +89,11 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
     ['patches.measured.json']
     """
     written = []
-    for path in sorted(Path(folder).glob("*.json")):
+    try:
+        paths = sorted(Path(folder).glob("*.json"))
+    except OSError as error:
+        raise DesignError(f"{folder}: cannot be read, {system_reason(error) or error}") from None
+    for path in paths:
         if path.name.endswith(".measured.json"):
             continue
         try:
@@ -103,7 +108,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
         except (KeyError, TypeError, ValueError, AttributeError, ArithmeticError, RecursionError) as error:
             raise DesignError(f"{path}: no complete sidecar ({type(error).__name__}: {error})") from None
         except OSError as error:
-            raise DesignError(f"{error.filename}: {error.strerror}") from None
+            raise DesignError(f"{path}: cannot be read, {system_reason(error) or error}") from None
     if not written:
         raise DesignError(f"{folder}: no sidecar of a board or sheet in it; print first, then measure")
     return written

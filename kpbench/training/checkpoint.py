@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from kpbench import __version__
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.patches.design import PATCH_KEYS, Patch
 from kpbench.toml import TomlTable, name_source
 from kpbench.training.network import SuperPoint
@@ -130,7 +130,8 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
             content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (OSError, SafetensorError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: cannot be read as a checkpoint ({str(error) or type(error).__name__})") from None
+        why = system_reason(error) or str(error) or type(error).__name__
+        raise DataError(f"{path}: cannot be read as a checkpoint ({why})") from None
     if not isinstance(content, dict) or content.get("schema") != SCHEMA:
         raise DataError(f"{path}: no checkpoint of kpbench train, expected schema {SCHEMA!r} inside")
     with name_source(path, DataError):

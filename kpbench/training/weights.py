@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from kpbench.detectors.verification import WEIGHTS
-from kpbench.errors import DataError
+from kpbench.errors import DataError, system_reason
 from kpbench.patches.design import Patch
 from kpbench.training.batches import load_photos, make_batch
 from kpbench.training.checkpoint import TrainingState, digest_designs, read_checkpoint, start_state
@@ -127,7 +127,7 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
             return dict(load_file(path))
         loaded = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # PyTorch's unpickler raises anything on a damaged file
-        why = (isinstance(error, OSError) and error.strerror) or "neither safetensors nor PyTorch's own"
+        why = system_reason(error) or "neither safetensors nor PyTorch's own"
         raise DataError(f"{path}: cannot be read as weights ({why})") from None
     if not isinstance(loaded, dict) or not all(
         isinstance(name, str) and isinstance(value, Tensor) for name, value in loaded.items()

@@ -245,7 +245,7 @@ BAD_FILES = [
     ("p.csv", b"image_id,x,y\n9223372036854775808,2,3\n", "line 2: image_id is '9223372036854775808', expected"),
     ("p.csv", b"image_id,x,y\n-4,2,3\n", "line 2: image_id is -4, expected 0 or more"),
     ("p.csv", b"image_id,x,y\n1,2,3\n1,2,3,4\n", "line 3 has 4 values, expected 3"),
-    ("p.csv", b"image_id,x,y\n1,2,3\n1,2\n", "line 3 (image_id 1): y is blank, expected a finite number"),
+    ("p.csv", b"image_id,x,y\n1,2,3\n1,2\n", "line 3 has 2 values, expected 3"),
     ("p.csv", b"image_id,x,y\n1,2,3\n\n1,2,3\n", "line 3 has 0 values, expected 3"),
     ("p.csv", b"image_id,x,y\n1,inf,3\n", "line 2 (image_id 1): x is inf, expected a finite number"),
     ("p.csv", b"image_id,x,y,score\n1,nan,3,1\n", "line 2: x is 'nan', expected a finite number"),
@@ -268,6 +268,7 @@ def test_a_bad_file_is_one_line(tmp_path, name, content, problem):
     assert gc.isenabled()  # paused while reading
 
 
+@pytest.mark.filterwarnings("ignore:.*it may be cut off:kpbench.errors.KpbenchWarning")
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_every_cut_of_a_file_is_refused(tmp_path, suffix):
     whole, cut = tmp_path / f"whole.{suffix}", tmp_path / f"cut.{suffix}"

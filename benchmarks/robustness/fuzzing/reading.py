@@ -47,8 +47,12 @@ def read_shard(path: Path) -> Any:
     """Read a shard with a manifest that lists this very file, as somebody who made both would write it."""
     data = path.read_bytes()
     entry = {"file": path.name, "first": 0, "count": 2, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    mark = hashlib.sha256("\n".join(["{}", entry["sha256"]]).encode()).hexdigest()
-    content = {"schema": "kpbench.dataset/1", "version": 1, "fingerprint": mark, "config": {}, "shards": [entry]}
+    configs = [json.loads(manifest)["config"] for manifest, _ in datasets()]
+    texts = [json.dumps(config, sort_keys=True, separators=(",", ":"), ensure_ascii=False) for config in configs]
+    config, text = next((pair for pair in zip(configs, texts, strict=True) if pair[1].encode() in data), ({}, "{}"))
+    mark = hashlib.sha256("\n".join([text, entry["sha256"]]).encode()).hexdigest()
+    content = {"schema": "kpbench.dataset/1", "version": 1, "fingerprint": mark, "config": config, "shards": [entry]}
+    content |= {"images": 2, "seed": config.get("seed")}
     (path.parent / "dataset.json").write_text(json.dumps(content))
     return read_dataset(path.parent)
 

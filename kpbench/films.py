@@ -1,0 +1,202 @@
+"""Films: videos, cameras and animated images as frames in order, with the frames that cannot be read.
+
+A frame that cannot be read is None, in its true place. ``docs/reference/detectors.md`` states the rules.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.errors import DataError, KpbenchWarning
+from kpbench.pixels import lay_on_white, png_chunk
+from kpbench.types import UInt8
+
+VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
+COUNTING_SUFFIXES = (".mp4", ".avi", ".mov", ".m4v")
+"""Videos that state the number of their frames. Others state a duration, which may be that of their sound."""
+DEFAULT_FPS = 25.0  # frames per second, of a film or camera that states no frame rate
+LEAST_FRAME_BYTES = 8
+"""Bytes in the file per frame; a file that states more frames states a wrong number."""
+MOST_BAD_FRAMES = 300
+"""Reading ends after so many frames in a row that cannot be read."""
+FRAMES_IN_DECODER = 32
+"""A decoder of several threads may report a bad frame so many frames early."""
+
+
+@dataclass(frozen=True)
+class Film:
+    """The frames of a film.
+
+    Attributes
+    ----------
+    frames : iterator of ndarray or None
+        RGB pixels; None for each frame that cannot be read.
+    length : int or None
+        Number of frames; None if unknown.
+    fps : float
+        Frames per second.
+    """
+
+    frames: Iterator[UInt8 | None]
+    length: int | None
+    fps: float
+
+
+def open_video(path: Path) -> Film:
+    """Open a video file.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be opened as a video.
+    """
+    capture = _open(cv2.VideoCapture(str(path)), str(path))
+    stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    length = stated if 0 < stated <= path.stat().st_size // LEAST_FRAME_BYTES else None
+    if length is None and stated > 0:
+        warnings.warn(f"{path}: states {stated} frames, more than it can hold", KpbenchWarning, stacklevel=3)
+    fps = _fps(capture)
+    frames = _video_frames(capture, length, fps, path.suffix.lower() in COUNTING_SUFFIXES)
+    return Film(_require_any(frames, path), length, fps)
+
+
+def open_camera(number: int) -> Film:
+    """Open a camera. Its frames end at the first frame that cannot be read.
+
+    Raises
+    ------
+    DataError
+        If there is no such camera.
+    """
+    capture = _open(cv2.VideoCapture(number), f"camera:{number}")
+
+    def frames() -> Iterator[UInt8 | None]:
+        while (found := capture.read())[0]:
+            yield _rgb(found[1])
+        capture.release()
+
+    return Film(frames(), None, _fps(capture))
+
+
+def _open(capture: cv2.VideoCapture, name: str) -> cv2.VideoCapture:
+    if not capture.isOpened():
+        raise DataError(f"{name}: cannot be opened as a video")
+    return capture
+
+
+def _fps(capture: cv2.VideoCapture) -> float:
+    stated = capture.get(cv2.CAP_PROP_FPS)
+    return stated if 0 < stated < np.inf else DEFAULT_FPS
+
+
+def _rgb(frame: NDArray[Any]) -> UInt8:
+    return np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def _require_any(frames: Iterator[UInt8 | None], path: Path) -> Iterator[UInt8 | None]:
+    """Pass the frames on; raise an error if there are none."""
+    is_empty = True
+    for frame in frames:
+        is_empty = False
+        yield frame
+    if is_empty:
+        raise DataError(f"{path}: holds no frame that can be read")
+
+
+def _video_frames(
+    capture: cv2.VideoCapture, length: int | None, fps: float, is_counted: bool
+) -> Iterator[UInt8 | None]:
+    """Yield every frame in its place.
+
+    A failed reading does not tell how many frames it skipped. The time stamp of the next good frame does.
+    """
+    number, failures, start_ms = 0, 0, 0.0
+    while length is None or number < length or not failures:
+        good, frame = capture.read()
+        if not good:
+            failures += 1
+            missing = 0 if length is None else min(MOST_BAD_FRAMES, length - number)
+            if failures > missing + FRAMES_IN_DECODER:
+                break
+            continue
+        stamp_ms = capture.get(cv2.CAP_PROP_POS_MSEC)
+        if not number and not failures:
+            start_ms = stamp_ms
+        if failures:
+            place = round((stamp_ms - start_ms) * fps / 1000) if stamp_ms > 0 else number + failures
+            last = number + failures + MOST_BAD_FRAMES if length is None else length - 1
+            skipped = max(0, min(place, last) - number)
+            yield from [None] * skipped
+            number, failures = number + skipped, 0
+        yield _rgb(frame)
+        number += 1
+    capture.release()
+    missing = 0 if length is None else length - number
+    if is_counted or missing > fps:
+        yield from [None] * missing
+
+
+def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
+    """Open a GIF, an APNG or a WebP with more than one frame; None if the file is none.
+
+    Each frame is drawn over the earlier ones. After a frame that cannot be read, no later frame can be read.
+    """
+    head = data[:21].tobytes()
+    is_gif = head[:6] in (b"GIF87a", b"GIF89a")
+    is_webp = head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and len(head) == 21 and bool(head[20] & 2)
+    if not (is_gif or is_webp or png_chunk(data, b"acTL")):
+        return None
+    from PIL import Image
+
+    try:
+        image = Image.open(io.BytesIO(data.tobytes()))
+        length = getattr(image, "n_frames", 1)
+        if is_webp:
+            image.load()  # which reads the duration
+    except Exception:  # damaged in a way that Pillow has an error of its own for; OpenCV may read the first frame
+        return None
+    if length < 2:
+        return None
+    if is_gif and not data[-64:].tobytes().rstrip(b"\0").endswith(b";"):
+        warnings.warn(f"{path}: is cut off after frame {length - 1}", KpbenchWarning, stacklevel=2)
+
+    def frames() -> Iterator[UInt8 | None]:
+        for n in range(length):
+            try:
+                image.seek(n)
+                pixels = np.asarray(image.convert("RGBA"), np.uint8)
+            except Exception:
+                yield from [None] * (length - n)
+                return
+            yield lay_on_white(pixels)
+
+    duration_ms = image.info.get("duration") or 1000 / DEFAULT_FPS
+    return Film(frames(), length, 1000 / duration_ms)
+
+
+def name_frames(numbers: Iterable[int], length: int | None = None) -> str:
+    """Return frames in words, in order, and the number of all frames if it is known.
+
+    Examples
+    --------
+    >>> from kpbench.films import name_frames
+    >>> name_frames([7, 12, 13, 14], 30)
+    'frames 7 and 12 to 14 of 30'
+    """
+    runs: list[Sequence[int]] = [
+        [n for _, n in run] for _, run in groupby(enumerate(sorted(numbers)), lambda pair: pair[1] - pair[0])
+    ]
+    words = [f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs]
+    *some, last = words if len(words) <= 8 else [*words[:7], f"{sum(map(len, runs[7:]))} more"]
+    plural = "" if len(runs) == 1 and len(runs[0]) == 1 else "s"
+    return f"frame{plural} {', '.join(some)}{' and ' if some else ''}{last}" + (f" of {length}" if length else "")
