@@ -32,6 +32,7 @@ GROUND = {
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],
     "signals": [],
+    "hdf5": ["files"],
     "images": ["errors", "types", "files", "writing"],
     "workers": ["errors", "signals"],
     "seeds": [],
@@ -59,7 +60,7 @@ ROOMS = {
 LAST = "cli"
 """The room that may import every other one, and that no other may import."""
 TORCH_ROOM = "training"
-H5PY_MODULES = {"dataset.shard", "predictions.table_files"}
+H5PY_MODULES = {"hdf5", "dataset.shard", "predictions.table_files"}
 ONNXRUNTIME_ROOMS = {"detectors", TORCH_ROOM}
 HEAVY = {"torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
 """Packages that neither ``import kpbench`` nor ``kpbench --help`` loads."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import DATASET_SCHEMA, canonical_json, encode_utf8, open_shard, shard_errors
+from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, encode_utf8, open_shard, shard_errors
 from kpbench.errors import DataError
 from kpbench.files import folder_at, is_local, note_read, sha256_of
 from kpbench.text import is_name
@@ -122,7 +122,7 @@ class Dataset:
         self.provenance: dict[str, Any] = manifest.get("provenance", {})
         self.shards = tuple(ShardEntry(**entry) for entry in manifest["shards"])
         self._starts = np.array([shard.first for shard in self.shards], np.int64)
-        self._files: dict[str, Any] = {}
+        self._files: dict[str, Shard] = {}
         self._process = os.getpid()
 
     def __len__(self) -> int:
@@ -133,7 +133,7 @@ class Dataset:
         state.pop("truth", None)
         return state
 
-    def _open(self, n: int) -> Any:
+    def _open(self, n: int) -> Shard:
         """Return the open file of shard n. If too many shards are open, close the least recently used shard."""
         if self._process != os.getpid():  # after a fork, the open files belong to the parent
             self._files, self._process = {}, os.getpid()
@@ -144,7 +144,7 @@ class Dataset:
         self._files[name] = file  # the last file in the dict is the file used last
         return file
 
-    def _locate(self, index: int) -> tuple[Any, int, Path]:
+    def _locate(self, index: int) -> tuple[Shard, int, Path]:
         """Return the open file that holds an image, the image's row in the file, and the file's path."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path} has {len(self)} images, there is no index {index}")
@@ -155,7 +155,7 @@ class Dataset:
         """Return image number ``index``, counted from 0, as a uint8 array of shape (H, W) or (H, W, 3)."""
         file, row, path = self._locate(index)
         with shard_errors(path):
-            return np.asarray(file["images"][row])
+            return file.image(row)
 
     def keypoints(self, index: int) -> NDArray[Any]:
         """Return the true keypoints of image number ``index``, a table of :data:`kpbench.KEYPOINT_DTYPE`."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from kpbench.dataset.card import CARD_FILES
 from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
-from kpbench.dataset.shard import canonical_json, open_shard, read_text_attribute
+from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
 from kpbench.files import sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers
@@ -154,8 +154,8 @@ def read_shard_head(path: Path) -> ShardHead:
     """Open a shard, and return the facts that tell to which dataset and to which place in it the shard belongs."""
     with open_shard(path) as file:
         ids = file["image_id"][:]
-        broken_files = tuple(json.loads(read_text_attribute(file, "broken_backgrounds")))
-        return ShardHead(read_text_attribute(file, "config"), broken_files, range(int(ids[0]), int(ids[-1]) + 1))
+        broken_files = tuple(json.loads(file.texts["broken_backgrounds"]))
+        return ShardHead(file.texts["config"], broken_files, range(int(ids[0]), int(ids[-1]) + 1))
 
 
 def first_difference(found: dict[str, Any], expected: dict[str, Any]) -> str:
