@@ -26,6 +26,7 @@ import h5py
 import numpy as np
 
 from kpbench.files import is_local, note_read
+from kpbench.signals import block_end_signals
 
 MOST_OBJECTS = 64
 """Largest number of objects in a file."""
@@ -256,7 +257,8 @@ def _running_child() -> subprocess.Popen[bytes]:
     # -I and -S: imports come from the standard library and from the folders of these three packages
     words = [sys.executable, "-I", "-S", "-c", COMMAND, *folders]
     pipe = subprocess.PIPE
-    child = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=_child_environment())
+    with block_end_signals():  # the child process ends with this process
+        child = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, env=_child_environment())
     _child = (os.getpid(), child)
     return child
 
@@ -285,7 +287,6 @@ atexit.register(_stop_child)
 
 def check_files() -> None:
     """Check the files that the parent process names, until the parent process ends. This is the child process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _limit_memory()
     while True:
         try:

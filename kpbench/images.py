@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from kpbench.decoding import decode_image, read_bytes, require_opencv_name
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read
 from kpbench.types import UInt8
@@ -74,16 +75,17 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         files = image_files(path, exclude)
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
-        return ImageSource(((name, _decode(path / name)) for name in files), len(files))
+        return ImageSource(((name, read_rgb(path / name)) for name in files), len(files))
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
         note_read(path)
+        require_opencv_name(path)
         capture = cv2.VideoCapture(str(path))
         return _open_video(capture, source, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-    image = _decode(path)
+    image = read_rgb(path)
     if image is None:
-        raise DataError(f"{path}: cannot be decoded as an image")
+        raise DataError(f"{path}: cannot be decoded as an image of at most 200 megapixels")
     return ImageSource(iter([(path.name, image)]), 1)
 
 
@@ -100,12 +102,9 @@ def refuse_same_folder(source: str | Path, target: Path) -> None:
         raise DataError(f"{target}: holds the images themselves, which would be overwritten; name another place")
 
 
-def _decode(path: Path) -> UInt8 | None:
-    note_read(path)
-    try:
-        image = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_COLOR)
-    except (OSError, cv2.error):
-        return None
+def read_rgb(path: Path) -> UInt8 | None:
+    """Return an image file as RGB, rotated by its EXIF data; None if the file cannot be decoded."""
+    image = decode_image(read_bytes(path), cv2.IMREAD_COLOR)
     return None if image is None else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
@@ -178,6 +177,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8], N
     OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
     """
     require_writable(target, "video")
+    require_opencv_name(target)
     part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
     sizes = set[tuple[int, int]]()
@@ -248,11 +248,7 @@ def decode_photo(path: Path, channels: int) -> UInt8 | None:
     Return None if the file cannot be decoded, or the image has a side under 8 px.
     """
     flags = (cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR) | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        data = np.fromfile(path, np.uint8)
-        image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):
-        return None
+    image = decode_image(read_bytes(path), flags)
     if image is None or min(image.shape[:2]) < 8:
         return None
     return np.asarray(image if channels == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

@@ -32,8 +32,9 @@ GROUND = {
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],
     "signals": [],
-    "hdf5": ["files"],
-    "images": ["errors", "types", "files", "writing"],
+    "decoding": ["errors", "files"],
+    "hdf5": ["files", "signals"],
+    "images": ["errors", "types", "files", "decoding", "writing"],
     "workers": ["errors", "signals"],
     "seeds": [],
 }

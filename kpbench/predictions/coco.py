@@ -136,13 +136,13 @@ class CocoDataset:
         DataError
             If the image is missing or cannot be decoded, or the file does not lie below the folder of the annotations.
         """
-        import cv2
+        from kpbench.images import read_rgb  # here, as scores need no OpenCV
 
         for prefix in ("", "images/") if self.files[index] else ():
             path = path_below(self.path.parent, prefix + self.files[index])
-            pixels = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            pixels = read_rgb(path)
             if pixels is not None:
-                return np.asarray(pixels[..., ::-1], np.uint8)
+                return pixels
         raise DataError(f"{self.path.parent / self.files[index]}: no image there that can be decoded")
 
 
