@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, encode_utf8, open_shard, shard_errors
+from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, open_shard, shard_errors
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local, note_read, sha256_of
+from kpbench.files import encode_utf8, folder_at, is_local, load_json, note_read, sha256_of
 from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
@@ -83,7 +83,7 @@ def write_manifest(
 def recorded_digests(folder: Path) -> dict[str, str]:
     """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
     try:
-        shards = json.loads((folder / MANIFEST).read_text("utf-8"))["shards"]
+        shards = load_json((folder / MANIFEST).read_text("utf-8"))["shards"]
         return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
@@ -168,7 +168,7 @@ class Dataset:
         """Return the records of the effects that degraded image number ``index``, in the order of application."""
         file, row, path = self._locate(index)
         with shard_errors(path):
-            return list(json.loads(file["degradations"].asstr()[row]))
+            return list(load_json(file["degradations"].asstr()[row]))
 
     def __getitem__(self, index: int) -> tuple[UInt8, NDArray[Any]]:
         return self.image(index), self.keypoints(index)
@@ -254,7 +254,7 @@ def _read_manifest(folder: Path) -> Dataset:
     try:
         if is_local(manifest):
             note_read(manifest)
-        content = json.loads(manifest.read_text("utf-8"))
+        content = load_json(manifest.read_text("utf-8"))
         if content["schema"] != DATASET_SCHEMA:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
         return Dataset(folder, content)
@@ -266,6 +266,6 @@ def _read_manifest(folder: Path) -> Dataset:
         raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
         raise DataError(f"{manifest}: cannot be read, {error.strerror}") from None
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
         expected = "JSON with schema, config, fingerprint and shards"
         raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None

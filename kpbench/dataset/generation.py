@@ -8,7 +8,6 @@ merged.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
 import shutil
@@ -37,7 +36,7 @@ from kpbench.dataset.resume import (
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local, make_folder
+from kpbench.files import folder_at, is_local, load_json, make_folder
 from kpbench.locks import lock_folder
 from kpbench.workers import Progress, dask_executor, run_jobs
 from kpbench.writing import remove_leftovers, write_file
@@ -227,7 +226,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
         present = sorted(folder.glob("shard-*.h5"))
         if not present:
             raise DataError(f"{folder}: no shards there; name the folders of the `parts`")
-        written = json.loads(read_shard_head(present[0]).config)
+        written = load_json(read_shard_head(present[0]).config)
         plan = plan_shards(written["n"], written["shard_size"])
         missing = [n for n, shard in enumerate(plan) if not (folder / shard.file).exists()]
         if missing:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -14,7 +13,7 @@ from kpbench.dataset.card import CARD_FILES
 from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
 from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
-from kpbench.files import sha256_of
+from kpbench.files import load_json, sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
 LONGEST_VALUE = 40
@@ -141,7 +140,7 @@ def find_finished_shards(
             continue
         head = read_shard_head(path)
         if head.config != canonical_json(config) or head.images != range(planned.first, planned.first + planned.count):
-            difference = first_difference(json.loads(head.config), config)
+            difference = first_difference(load_json(head.config), config)
             raise DataError(f"{path}: of another dataset{difference}{remedy}")
         entry = ShardEntry(planned.file, planned.first, planned.count, path.stat().st_size, sha256_of(path))
         if digests.get(planned.file, entry.sha256) != entry.sha256:
@@ -154,7 +153,7 @@ def read_shard_head(path: Path) -> ShardHead:
     """Open a shard, and return the facts that tell to which dataset and to which place in it the shard belongs."""
     with open_shard(path) as file:
         ids = file["image_id"][:]
-        broken_files = tuple(json.loads(file.texts["broken_backgrounds"]))
+        broken_files = tuple(load_json(file.texts["broken_backgrounds"]))
         return ShardHead(file.texts["config"], broken_files, range(int(ids[0]), int(ids[-1]) + 1))
 
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
+from kpbench.files import encode_utf8
 from kpbench.hdf5 import Column, Layout, open_hdf5
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
@@ -267,8 +268,3 @@ def _check_shard(file: Any, texts: Mapping[str, str]) -> None:
     offsets = file["offsets"][:]
     if offsets[0] != 0 or offsets[-1] != len(file["keypoints"]) or np.any(np.diff(offsets) < 0):
         raise ValueError("/offsets does not fit /keypoints")
-
-
-def encode_utf8(text: str) -> bytes:
-    """Encode text as UTF-8. Bytes of file names that are not valid text are escaped as in JSON."""
-    return text.encode(errors="backslashreplace")
