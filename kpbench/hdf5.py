@@ -32,7 +32,7 @@ MOST_OBJECTS = 64
 """Largest number of objects in a file."""
 LARGEST_CHUNK = 2**30
 """Largest accepted number of bytes of one chunk, unpacked."""
-LARGEST_TEXT = 2**24
+LARGEST_ATTRIBUTE = 2**24
 """Largest accepted number of bytes of an attribute."""
 MOST_INFLATION = 1100
 """Largest accepted ratio of unpacked to packed bytes. Deflate reaches at most 1032."""
@@ -205,12 +205,12 @@ def _read_text(file: Any, name: str, in_child: bool) -> str | None:
         raise StructureError(f"the attribute {name} is no text")
     if kind.is_variable_str() and not in_child:
         raise StructureError(f"the attribute {name} is a text of variable length, expected a fixed length")
-    if kind.get_size() > LARGEST_TEXT:
-        raise StructureError(f"the attribute {name} has {kind.get_size()} bytes, expected at most {LARGEST_TEXT}")
+    if kind.get_size() > LARGEST_ATTRIBUTE:
+        raise StructureError(f"the attribute {name} has {kind.get_size()} bytes, expected at most {LARGEST_ATTRIBUTE}")
     value = file.attrs[name]
     text = value.decode() if isinstance(value, bytes) else str(value)
-    if len(text) > LARGEST_TEXT:
-        raise StructureError(f"the attribute {name} is longer than {LARGEST_TEXT} bytes")
+    if len(text) > LARGEST_ATTRIBUTE:
+        raise StructureError(f"the attribute {name} is longer than {LARGEST_ATTRIBUTE} bytes")
     return text
 
 

@@ -16,6 +16,8 @@ from kpbench.errors import DataError
 from kpbench.files import load_json, sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
+MOST_SHARDS = 4_000_000
+"""Largest number of shards of a dataset."""
 LONGEST_VALUE = 40
 """An error message shows two different values of a key only if each value has fewer characters than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
@@ -51,6 +53,8 @@ class ShardHead:
 def plan_shards(n: int, shard_size: int) -> list[PlannedShard]:
     """List all shards of a dataset of n images."""
     firsts = range(0, n, shard_size)
+    if len(firsts) > MOST_SHARDS:
+        raise DataError(f"`n` is {n}: {len(firsts)} shards of {shard_size} images, expected at most {MOST_SHARDS}")
     return [PlannedShard(f"shard-{k:05d}.h5", first, min(shard_size, n - first)) for k, first in enumerate(firsts)]
 
 

@@ -20,6 +20,10 @@ from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, p
 from kpbench.text import escape_csv_comment
 from kpbench.types import Predictions, offsets_of
 
+ROOM_BYTES, MOST_EXPANSION = 2**26, 1100
+"""A Parquet file may declare so many bytes of numbers, and so many more per byte of the file."""
+MOST_COLUMNS = 100
+"""Largest number of columns of a Parquet file."""
 H5_FILTERS = ("shuffle", "gzip", "fletcher32")
 """HDF5 filters that columns may use."""
 
@@ -196,6 +200,15 @@ def read_parquet(path: Path) -> Predictions:
     """
     pa, pq = _import_pyarrow()
     try:
+        described = pq.read_metadata(path)
+        # plain numbers need 8 bytes per cell; Parquet's own counts may say anything
+        declared = max(8 * described.num_rows * described.num_columns, _unpacked_bytes(described))
+        most = ROOM_BYTES + MOST_EXPANSION * path.stat().st_size
+        if not 0 <= declared <= most or described.num_columns > MOST_COLUMNS:
+            raise PredictionsError(
+                f"declares {described.num_rows} rows, {described.num_columns} columns and {declared} bytes, "
+                f"expected at most {MOST_COLUMNS} columns and {most} bytes in a file of this size"
+            )
         table = pq.read_table(path)
     except (pa.ArrowException, ValueError) as error:
         raise PredictionsError(f"damaged or no Parquet file ({' '.join(str(error).split())[:120]})") from None
@@ -213,6 +226,12 @@ def read_parquet(path: Path) -> Predictions:
         except (pa.ArrowException, ValueError) as error:
             raise PredictionsError(f"column {name} holds no plain numbers ({str(error)[:80]})") from None
     return build_predictions(columns, header, lambda row: f"row {row}")
+
+
+def _unpacked_bytes(described: Any) -> int:
+    """Return how many bytes the columns of a Parquet file say that they have when they are unpacked."""
+    groups = (described.row_group(n) for n in range(described.num_row_groups))
+    return sum(group.column(k).total_uncompressed_size for group in groups for k in range(group.num_columns))
 
 
 def _import_pyarrow() -> tuple[Any, Any]:
