@@ -36,7 +36,7 @@ LARGEST_ATTRIBUTE = 2**24
 """Largest accepted number of bytes of an attribute."""
 MOST_INFLATION = 1100
 """Largest accepted ratio of unpacked to packed bytes. Deflate reaches at most 1032."""
-CHECK_SECONDS, CHECK_BYTES_PER_SECOND = 3.0, 10e6
+CHECK_SECONDS, CHECK_BYTES_PER_SECOND = 1.0, 10e6
 """Processor time that the child process may take for a file: so many seconds, and one more per so many bytes."""
 CHECK_MEMORY = 4 * 2**30
 """Bytes of memory that the child process may take."""
@@ -85,11 +85,14 @@ class Layout:
         Names of attributes of the file that hold a text; each may be missing.
     has_others : bool
         Whether the file may hold other objects. They are never opened.
+    has_variable_texts : bool
+        Whether texts may be of variable length. Only the child process reads them.
     """
 
     columns: Mapping[str, Column]
     texts: tuple[str, ...]
     has_others: bool = False
+    has_variable_texts: bool = False
 
 
 def open_hdf5(path: Path, layout: Layout) -> tuple[Any, dict[str, str]]:
@@ -140,7 +143,7 @@ def _check_file(file: Any, layout: Layout, file_bytes: int, in_child: bool) -> d
             rows = data.chunks[0] * max(1, 2**24 // max(1, _bytes_of(data, data.chunks)))
             for start in range(0, len(data), rows):
                 data[start : start + rows]
-    texts = {name: _read_text(file, name, in_child) for name in layout.texts if name in file.attrs}
+    texts = {name: _read_text(file, name, layout.has_variable_texts and in_child) for name in layout.texts if name in file.attrs}
     return {name: text for name, text in texts.items() if text is not None}
 
 
@@ -197,13 +200,13 @@ def _stored_bytes(name: str, data: Any, column: Column, file_bytes: int) -> int:
     return stored
 
 
-def _read_text(file: Any, name: str, in_child: bool) -> str | None:
-    """Return a text attribute. Only the child process reads a text of variable length."""
+def _read_text(file: Any, name: str, may_be_variable: bool) -> str | None:
+    """Return a text attribute."""
     attribute = h5py.h5a.open(file.id, name.encode())
     kind = attribute.get_type()
     if kind.get_class() != h5py.h5t.STRING or attribute.shape != ():
         raise StructureError(f"the attribute {name} is no text")
-    if kind.is_variable_str() and not in_child:
+    if kind.is_variable_str() and not may_be_variable:
         raise StructureError(f"the attribute {name} is a text of variable length, expected a fixed length")
     if kind.get_size() > LARGEST_ATTRIBUTE:
         raise StructureError(f"the attribute {name} has {kind.get_size()} bytes, expected at most {LARGEST_ATTRIBUTE}")
@@ -253,6 +256,7 @@ def _running_child() -> subprocess.Popen[bytes]:
     global _child
     if _child is not None and _child[0] == os.getpid() and _child[1].poll() is None:
         return _child[1]
+    _stop_child()
     folders = [str(Path(module.__file__ or "").parents[1]) for module in (sys.modules["kpbench"], h5py, np)]
     # -I and -S: imports come from the standard library and from the folders of these three packages
     words = [sys.executable, "-I", "-S", "-c", COMMAND, *folders]

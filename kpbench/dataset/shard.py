@@ -229,6 +229,8 @@ class Shard:
             pixels = np.frombuffer(deflate.zlib_decompress(packed, self._image_bytes), np.uint8)
         except deflate.DeflateError as error:
             raise ValueError(f"image {row} cannot be unpacked, {error}") from None
+        if len(pixels) != self._image_bytes:
+            raise ValueError(f"image {row} has {len(pixels)} bytes, expected {self._image_bytes}")
         return pixels.reshape(shape)
 
 

@@ -270,7 +270,7 @@ def read_h5(path: Path) -> Predictions:
         for name, kind in H5_COLUMNS.items()
     }
     try:
-        file, texts = open_hdf5(path, Layout(columns, ("header",)))
+        file, texts = open_hdf5(path, Layout(columns, ("header",), has_variable_texts=True))
         with file:
             table = {name: file[name][:] for name in columns if name in file}
     except StructureError as error:
