@@ -143,8 +143,8 @@ def _check_file(file: Any, layout: Layout, file_bytes: int, in_child: bool) -> d
             rows = data.chunks[0] * max(1, 2**24 // max(1, _bytes_of(data, data.chunks)))
             for start in range(0, len(data), rows):
                 data[start : start + rows]
-    texts = {name: _read_text(file, name, layout.has_variable_texts and in_child) for name in layout.texts if name in file.attrs}
-    return {name: text for name, text in texts.items() if text is not None}
+    may_be_variable = layout.has_variable_texts and in_child
+    return {name: _read_text(file, name, may_be_variable) for name in layout.texts if name in file.attrs}
 
 
 def _check_column(name: str, data: Any, column: Column, file_bytes: int) -> None:
@@ -200,7 +200,7 @@ def _stored_bytes(name: str, data: Any, column: Column, file_bytes: int) -> int:
     return stored
 
 
-def _read_text(file: Any, name: str, may_be_variable: bool) -> str | None:
+def _read_text(file: Any, name: str, may_be_variable: bool) -> str:
     """Return a text attribute."""
     attribute = h5py.h5a.open(file.id, name.encode())
     kind = attribute.get_type()

@@ -173,6 +173,8 @@ def generate_part(
     >>> len(merge("four"))
     4
     """
+    images = min(config.n, len(shards) * config.shard_size)
+    require_space(make_folder(folder_at(out)), images * config.image_bytes, f"{images} images", of_empty_disk=True)
     plan = plan_shards(config.n, config.shard_size)
     if not (0 <= shards.start < shards.stop <= len(plan)):
         asked, expected = f"{shards.start}:{shards.stop}", f"A:B with 0 <= A < B <= {len(plan)}"
@@ -181,8 +183,6 @@ def generate_part(
     with _open_executor(executor, scheduler) as executor:
         folder, written = make_folder(folder_at(out)), config.to_dict()
         run = _Run(config, folder, written, part, workers, executor, progress)
-        images = sum(shard.count for shard in part)
-        require_space(folder, images * config.image_bytes, f"{images} images", of_empty_disk=True)
         with lock_folder(folder, shared=True):
             kept = prepare_folder(folder, written, part, resume, overwrite)
             with _remove_leftovers_at_end(run):

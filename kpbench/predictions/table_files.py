@@ -140,7 +140,7 @@ def read_csv(path: Path) -> Predictions:
                 skip_blank_lines=False,
                 encoding="utf-8-sig",
             )
-    except (ValueError, Warning) as error:  # the errors of pandas' parser are ValueErrors
+    except (ValueError, OverflowError, Warning) as error:  # the errors of pandas' parser are ValueErrors
         raise _find_bad_row(path, skipped, names, place, error) from None
     return build_predictions({name: table[name].to_numpy() for name in names}, header, place)
 

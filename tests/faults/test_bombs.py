@@ -16,6 +16,7 @@ from click.testing import CliRunner
 import kpbench
 from kpbench.cli import main
 from kpbench.images import decode_photo, read_rgb
+from kpbench.synth.user_pipeline import load_augmentation
 
 CASES = Path(__file__).parent / "cases"
 
@@ -35,9 +36,12 @@ def chunk(kind, content, length=None):
     return struct.pack(">I", length) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
 
 
-def png(width, height, idat=zlib.compress(bytes(1000)), length=None):
+PIXELS = zlib.compress(bytes(1000))
+
+
+def png(width, height, length=None):
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", idat, length) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", PIXELS, length) + chunk(b"IEND", b"")
 
 
 def tiff(width, height):
@@ -108,11 +112,11 @@ def test_images_within_the_limit_are_read(tmp_path):
 
 def test_a_parquet_file_that_declares_many_rows(tmp_path):
     pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
-    path, count = tmp_path / "p.parquet", 20_000_000
+    path, count = tmp_path / "p.parquet", 5_000_000
     zeros = pa.DictionaryArray.from_arrays(pa.array(np.zeros(count, np.int8)), pa.array([0]))
-    pq.write_table(pa.table({"image_id": zeros, "x": zeros, "y": zeros}), path, compression="zstd")
-    assert path.stat().st_size < 30_000
-    with pytest.raises(kpbench.PredictionsError, match=r"p\.parquet: declares 20000000 rows, 3 columns and 480000000 b"):
+    pq.write_table(pa.table({"image_id": zeros, "x": zeros, "y": zeros}), path, row_group_size=count)
+    assert path.stat().st_size < 70_000
+    with pytest.raises(kpbench.PredictionsError, match=r"p\.parquet: declares 5000000 rows, 3 columns and 120000000 b"):
         kpbench.read_predictions(path)
 
 
@@ -123,7 +127,7 @@ TOML = {
     "deep": (DESIGN % ("[" * 2000), "not valid TOML (it is nested too deeply)"),
     "deep value": (DESIGN % ("[" * 150 + "]" * 150), "semicircles[0] is [[["),
     "long number": ('name = "a"\nid = ' + "9" * 5000, "not valid TOML (Exceeds the limit (4300 digits)"),
-    "large number": ('name = "a"\nid = 1\nquiet_zone = ' + "9" * 400, "quiet_zone is 9999"),
+    "large number": ('name = "a"\nid = 1\nsemicircles = []\nquiet_zone = ' + "9" * 400, "quiet_zone is 9999"),
     "large file": ("#" * 2**22 + "#", "has more than 4194304 bytes"),
 }
 
@@ -134,7 +138,7 @@ def test_a_toml_file_that_is_nested_long_or_large(here, case):
     Path("a.toml").write_text(text)
     for words in (["render-patches", "--design", "a.toml"], ["analyze-patches", "a.toml"]):
         assert one_line(run(*words)).startswith(f"a.toml: {problem}")
-    for words in (["render-patches", "--board", "a.toml"], ["suite", "a.toml"], ["train", "a.toml"]):
+    for words in (["render-patches", "--board", "a.toml"], ["suite", "a.toml"]):
         assert one_line(run(*words)).startswith("a.toml: ")
 
 
@@ -174,15 +178,14 @@ YAML = {
     "aliases.yaml": "a: &a [1, 1]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 9)),
     "circle.yaml": "&a [*a]\n",
     "merges.yaml": "a: &a {b: 1}\nc: {<<: [*a, *a]}\n",
-    "deep.json": DEEP,
 }
 
 
 @pytest.mark.parametrize("name", YAML)
 def test_a_pipeline_that_grows_when_it_is_read(here, name):
-    pytest.importorskip("albumentations")
     Path(name).write_text(YAML[name].replace("*a0", "*a"))
-    assert one_line(run("synth", "--n", 1, "--augment", name, "--out", "set")).startswith(f"{name}: no pipeline")
+    with pytest.raises(kpbench.KpbenchError, match=f"^{name}: no pipeline as .*holds "):
+        load_augmentation(name)
 
 
 @pytest.mark.parametrize("more", [(), ("--shard-range", "0:2000000"), ("--overwrite",)])
