@@ -15,6 +15,7 @@ from click.testing import CliRunner
 
 import kpbench
 from kpbench.cli import main
+from kpbench.errors import KpbenchError, PredictionsError
 from kpbench.images import decode_photo, read_rgb
 from kpbench.synth.user_pipeline import load_augmentation
 
@@ -116,7 +117,7 @@ def test_a_parquet_file_that_declares_many_rows(tmp_path):
     zeros = pa.DictionaryArray.from_arrays(pa.array(np.zeros(count, np.int8)), pa.array([0]))
     pq.write_table(pa.table({"image_id": zeros, "x": zeros, "y": zeros}), path, row_group_size=count)
     assert path.stat().st_size < 70_000
-    with pytest.raises(kpbench.PredictionsError, match=r"p\.parquet: declares 5000000 rows, 3 columns and 120000000 b"):
+    with pytest.raises(PredictionsError, match=r"p\.parquet: declares 5000000 rows, 3 columns and 120000000 b"):
         kpbench.read_predictions(path)
 
 
@@ -184,7 +185,7 @@ YAML = {
 @pytest.mark.parametrize("name", YAML)
 def test_a_pipeline_that_grows_when_it_is_read(here, name):
     Path(name).write_text(YAML[name].replace("*a0", "*a"))
-    with pytest.raises(kpbench.KpbenchError, match=f"^{name}: no pipeline as .*holds "):
+    with pytest.raises(KpbenchError, match=f"^{name}: no pipeline as .*holds "):
         load_augmentation(name)
 
 
