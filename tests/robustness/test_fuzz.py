@@ -22,7 +22,6 @@ KNOWN = {
     r"coco: wrong: ": "radius of 0 or less, rung not finite, not UTF-8 where no key is known",
     r"predictions-csv: (traceback: (KeyError|OverflowError)|wrong: )": "spaces in the header, short rows, rounded ids",
     r"predictions-parquet: (traceback: KeyError|wrong: )": "spaces in names, columns of truth values, texts and times",
-    r"(predictions-h5|shard): (hang|crash|memory|traceback)": "text of variable length, chunks shorter than they say",
     r"(predictions-h5|shard): wrong: ": "chunks without their filters, columns of other types, an image twice",
     r"manifest: (traceback|wrong): ": "types and numbers of the manifest are not checked",
     r"sidecar: (traceback|wrong): ": "types and numbers of the sidecar are not checked",
@@ -30,7 +29,7 @@ KNOWN = {
     r"(onnx|checkpoint): (bad line: no file name|hang)": "as before; any number of designs",
     r"state-dict: traceback: ": "errors of torch's unpickler",
     r"pipeline-yaml: (hang|memory)": "aliases of aliases",
-    r"(png|jpeg|tiff|gif|other-images): (memory|wrong): ": "declared sizes, files cut off",
+    r"(png|jpeg|tiff|gif|other-images): wrong: ": "files cut off",
     r"(avi|mp4): wrong: number of frames differs": "films end at the first bad frame",
 }
 """What is known and not mended yet: a pattern of what ``outcomes`` tell, and why. It shrinks as causes are mended."""
