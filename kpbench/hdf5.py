@@ -187,16 +187,22 @@ def _stored_bytes(name: str, data: Any, column: Column, file_bytes: int) -> int:
     size = _bytes_of(data, data.chunks)
     if size > LARGEST_CHUNK:
         raise StructureError(f"/{name} has chunks of {size} bytes, expected at most {LARGEST_CHUNK}")
-    stored = 0
+    stored, places = 0, set[tuple[int, ...]]()
 
     def check_chunk(chunk: Any) -> None:
         nonlocal stored
         # Deflate makes data that cannot be packed a little larger
         if chunk.filter_mask or chunk.size > 1.01 * size + 100 or chunk.byte_offset + chunk.size > file_bytes:
             raise StructureError(f"/{name} has a chunk that is not packed as the others, or not in the file")
+        if any(at >= end for at, end in zip(chunk.chunk_offset, data.shape, strict=True)):
+            raise StructureError(f"/{name} has a chunk at {chunk.chunk_offset}, beyond its shape {data.shape}")
         stored += chunk.size
+        places.add(chunk.chunk_offset)
 
     data.id.chunk_iter(check_chunk)
+    expected = math.prod(-(-size // step) for size, step in zip(data.shape, data.chunks, strict=True))
+    if column.is_large and len(places) != expected:  # the library crashes when it is asked for a chunk that is missing
+        raise StructureError(f"/{name} has {len(places)} chunks, expected {expected}")
     return stored
 
 

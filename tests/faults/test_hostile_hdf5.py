@@ -166,6 +166,18 @@ def test_an_image_chunk_that_holds_another_number_of_bytes_is_refused(tmp_path, 
         shard.close()
 
 
+def test_a_shard_without_a_chunk_of_an_image_is_refused(tmp_path, dataset):
+    path = tmp_path / "shard.h5"
+    shutil.copy(dataset.path / "shard-00000.h5", path)
+    with h5py.File(path, "r+") as file:
+        shape, packed = file["images"].shape, file["images"].id.read_direct_chunk((0, 0, 0))[1]
+        del file["images"]
+        images = file.create_dataset("images", shape, "u1", chunks=(1, *shape[1:]), compression="gzip")
+        for n in range(shape[0] - 1):
+            images.id.write_direct_chunk((n, 0, 0), packed)
+    assert "/images has 3 chunks, expected 4" in refused(path, open_shard)
+
+
 def test_only_one_module_opens_hdf5_files_for_reading():
     package = Path(kpbench.__file__).parent
     for path in package.rglob("*.py"):
