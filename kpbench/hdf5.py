@@ -217,7 +217,10 @@ def _read_text(file: Any, name: str, may_be_variable: bool) -> str:
     if kind.get_size() > LARGEST_ATTRIBUTE:
         raise StructureError(f"the attribute {name} has {kind.get_size()} bytes, expected at most {LARGEST_ATTRIBUTE}")
     value = file.attrs[name]
-    text = value.decode() if isinstance(value, bytes) else str(value)
+    try:
+        text = (value if isinstance(value, bytes) else str(value).encode()).decode()
+    except UnicodeError:
+        raise StructureError(f"the attribute {name} is not UTF-8 text") from None
     if len(text) > LARGEST_ATTRIBUTE:
         raise StructureError(f"the attribute {name} is longer than {LARGEST_ATTRIBUTE} bytes")
     return text

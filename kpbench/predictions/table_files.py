@@ -277,7 +277,7 @@ def read_h5(path: Path) -> Predictions:
         raise PredictionsError(str(error)) from None
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
         raise PredictionsError(f"damaged or no HDF5 file ({' '.join(str(error).split())[:120]})") from None
-    header = parse_header(parse_json(texts["header"].encode(errors="replace"), "the attribute header")) if texts else {}
+    header = parse_header(parse_json(texts["header"].encode(), "the attribute header")) if texts else {}
     if table["xy"].shape[1:] != (2,):
         raise PredictionsError(f"/xy has shape {table['xy'].shape}, expected (K, 2)")
     return Predictions(
