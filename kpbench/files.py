@@ -178,7 +178,12 @@ def path_below(folder: Path, name: str) -> Path:
         If the path is absolute, has ``..`` or a drive letter, or leads out of the folder over a symbolic link.
     """
     path, parts = folder / name, PureWindowsPath(name)  # both separators, also on Linux
-    if parts.anchor or ".." in parts.parts or "\0" in name or not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        os.fsencode(name)
+        is_below = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
+    except UnicodeEncodeError:  # half of a surrogate pair: no file can have this name
+        is_below = False
+    if parts.anchor or ".." in parts.parts or not is_below:
         raise DataError(f"{name!r} is not read, expected a file below {folder}")
     return path
 
