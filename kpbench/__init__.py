@@ -10,7 +10,10 @@ Examples
 ['checker', 'trefoil', 'wheel', 'mushroom']
 """
 
+import os  # loaded before any file of a current folder can be
+
 __version__ = "0.1.0"
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000")  # OpenCV reads the limit when it is loaded
 
 
 def __getattr__(name: str) -> object:

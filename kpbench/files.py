@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import io
+import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path, PureWindowsPath
+from typing import Any
 from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError, system_reason
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
+LARGEST_TEXT = 2**22
+"""Largest accepted number of bytes of a design, a board, a suite, a recipe or a pipeline."""
 
 PACKAGE = Path(__file__).parent
 """Folder of this package."""
@@ -80,11 +85,45 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     """
     note_read(path)
     try:
-        return Path(path).read_text("utf-8")
+        with Path(path).open("rb") as file:
+            data = file.read(LARGEST_TEXT + 1)
+        if len(data) > LARGEST_TEXT:
+            raise error(f"{path}: has more than {LARGEST_TEXT} bytes, too many for such a file")
+        return io.TextIOWrapper(io.BytesIO(data), "utf-8").read()
     except OSError as problem:
         raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
     except UnicodeDecodeError:
         raise error(f"{path}: cannot be read, not UTF-8 text") from None
+    except ValueError:  # such as a NUL in the name
+        raise error(f"{str(path)!r}: no file can have this name") from None
+
+
+def load_json(text: str | bytes) -> Any:
+    """Return the content of a JSON text.
+
+    Raises
+    ------
+    ValueError
+        If the text is no JSON, or is nested too deeply.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def encode_utf8(text: str) -> bytes:
+    r"""Encode text as UTF-8. What is no text becomes an escape such as ``\udcff``: bytes of file names, surrogates."""
+    return text.encode(errors="backslashreplace")
+
+
+def escape_surrogates(content: Any) -> Any:
+    """Return the content of a JSON file with all its texts as :func:`encode_utf8` would write them."""
+    if isinstance(content, str):
+        return encode_utf8(content).decode()
+    if isinstance(content, Mapping):
+        return {escape_surrogates(key): escape_surrogates(value) for key, value in content.items()}
+    return [*map(escape_surrogates, content)] if isinstance(content, list | tuple) else content
 
 
 def require_readable(path: Path, error: type[KpbenchError] = DataError) -> None:
@@ -154,7 +193,12 @@ def path_below(folder: Path, name: str) -> Path:
         If the path is absolute, has ``..`` or a drive letter, or leads out of the folder over a symbolic link.
     """
     path, parts = folder / name, PureWindowsPath(name)  # both separators, also on Linux
-    if parts.anchor or ".." in parts.parts or "\0" in name or not path.resolve().is_relative_to(folder.resolve()):
+    try:
+        os.fsencode(name)
+        is_below = "\0" not in name and path.resolve().is_relative_to(folder.resolve())
+    except UnicodeEncodeError:  # half of a surrogate pair: no file can have this name
+        is_below = False
+    if parts.anchor or ".." in parts.parts or not is_below:
         raise DataError(f"{name!r} is not read, expected a file below {folder}")
     return path
 

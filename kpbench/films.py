@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.decoding import require_opencv_name
 from kpbench.errors import DataError, KpbenchWarning
 from kpbench.pixels import lay_on_white, png_chunk
 from kpbench.types import UInt8
@@ -60,6 +61,7 @@ def open_video(path: Path) -> Film:
     DataError
         If the file cannot be opened as a video.
     """
+    require_opencv_name(path)
     capture = _open(cv2.VideoCapture(str(path)), str(path))
     stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     length = stated if 0 < stated <= path.stat().st_size // LEAST_FRAME_BYTES else None

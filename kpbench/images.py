@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from kpbench.decoding import require_opencv_name
 from kpbench.errors import DataError, system_reason
 from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read, require_readable
 from kpbench.films import DEFAULT_FPS, VIDEO_SUFFIXES, Film, name_frames, open_animation, open_camera, open_video
@@ -213,6 +214,7 @@ def _video_writer(target: Path, fps: float) -> Iterator[Callable[[str, UInt8 | N
     OpenCV reports no error when the disk is full. The number of frames is therefore counted at the end.
     """
     require_writable(target, "video")
+    require_opencv_name(target)
     part = target.with_name(f".{target.stem}.{secrets.token_hex(4)}.part{target.suffix}")
     video: list[cv2.VideoWriter] = []
     sizes = set[tuple[int, int]]()

@@ -5,17 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from kpbench.errors import DataError, KpbenchWarning, system_reason
 from kpbench.files import is_local
 
 LOCK_FILE = ".kpbench.lock"
-NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
-"""Errors of a file system without locks."""
 
 
 @contextmanager
@@ -62,17 +59,3 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         finally:
             if not shared:
                 path.unlink(missing_ok=True)
-
-
-def open_with_lock_if_possible(open_file: Callable[..., Any], path: Path) -> Any:
-    """Open an HDF5 file for reading with ``h5py.File``, without a lock on a file system that has none.
-
-    A file that this process has open with a lock can only be opened with a lock, and one without only without.
-    """
-    try:
-        return open_file(path, "r", locking="best-effort")
-    except OSError as error:
-        is_open_without = "file locking flag values don't match" in str(error)
-        if error.errno not in NO_LOCKS and not is_open_without:
-            raise
-        return open_file(path, "r", locking=False)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.decoding import decode_image
 from kpbench.errors import KpbenchWarning
 from kpbench.types import UInt8
 
@@ -73,7 +74,7 @@ def decode_pixels(
             return np.asarray(
                 cv2.cvtColor(special, cv2.COLOR_BGR2GRAY if channels == 1 else cv2.COLOR_BGR2RGB), np.uint8
             )
-        image = cv2.imdecode(data, flags) if len(data) else None
+        image = decode_image(data, flags)
         if image is None or channels == 1:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
@@ -125,7 +126,7 @@ def _decode_deep_or_transparent(
     data: NDArray[np.uint8], rotate: bool, name: object, notes: Notes | None
 ) -> NDArray[np.uint8] | None:
     """Return the BGR pixels of a picture that uses 9 to 15 bits or is transparent; None for any other picture."""
-    image: Any = cv2.imdecode(data, cv2.IMREAD_UNCHANGED) if len(data) else None
+    image: Any = decode_image(data, cv2.IMREAD_UNCHANGED)
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     bits = 8 if image.dtype == np.uint8 else 16

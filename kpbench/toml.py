@@ -17,6 +17,8 @@ from kpbench.text import NAME_RULE, is_name
 
 LARGEST = sys.float_info.max
 """Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
+MOST_ENTRIES = 10_000
+"""Largest number of entries of a list of tables."""
 
 
 def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
@@ -27,10 +29,13 @@ def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
     error
         If the file cannot be read or is no TOML. The message names the file.
     """
+    text = read_text(path, error)
     try:
-        return tomllib.loads(read_text(path, error))
-    except tomllib.TOMLDecodeError as problem:
+        return tomllib.loads(text)
+    except ValueError as problem:  # TOMLDecodeError, or a number of thousands of digits
         raise error(f"{path}: not valid TOML ({problem})") from None
+    except RecursionError:
+        raise error(f"{path}: not valid TOML (it is nested too deeply)") from None
 
 
 @contextmanager
@@ -69,7 +74,7 @@ class TomlTable:
     def __post_init__(self) -> None:
         names = ", ".join(self.known)
         if not isinstance(self.values, Mapping):
-            raise self.error(f"{self.place or 'the file'} is {self.values!r}, expected a table with: {names}")
+            raise self.error(f"{self.place or 'the file'} is {_show(self.values)}, expected a table with: {names}")
         for key in self.values:
             if key not in self.known:
                 within = f" in {self.place}" if self.place else ""
@@ -84,7 +89,7 @@ class TomlTable:
 
     def problem(self, key: str, expected: str) -> KpbenchError:
         """Return the error for the wrong value of a key. The caller raises the error."""
-        value = repr(self.values[key]) if key in self.values else "missing"
+        value = _show(self.values[key]) if key in self.values else "missing"
         return self.error(f"{self.path(key)} is {value}, expected {expected}")
 
     def require_schema(self, schema: str, optional: bool = False) -> None:
@@ -158,18 +163,28 @@ class TomlTable:
         """Return the table under a key."""
         return TomlTable(self.values.get(key, default), known, self.error, self.path(key))
 
-    def tables(self, key: str, known: Collection[str]) -> list[TomlTable]:
-        """Return the list of tables under a key."""
+    def tables(self, key: str, known: Collection[str], most: int = MOST_ENTRIES) -> list[TomlTable]:
+        """Return the list of tables under a key, with at most ``most`` entries."""
         value = self.values.get(key)
         if not isinstance(value, list | tuple):
             raise self.problem(key, f"a list of tables with: {', '.join(known)}")
+        if len(value) > most:
+            raise self.error(f"{self.path(key)} has {len(value)} entries, expected at most {most}")
         return [TomlTable(entry, known, self.error, f"{self.path(key)}[{n}]") for n, entry in enumerate(value)]
 
     def _number(self, key: str, value: object, low: float, high: float, whole: bool = False) -> float:
         limits = f"from {low:.10g}" if high == math.inf else f"from {low:.10g} to {high:.10g}"
-        problem = f"{self.path(key)} is {'missing' if value is None else repr(value)}"
+        problem = f"{self.path(key)} is {'missing' if value is None else _show(value)}"
         if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
             raise self.error(f"{problem}, expected a {'whole ' * whole}number {limits}")
         if abs(value) > LARGEST or (whole and value % 1):
             raise self.error(f"{problem}, expected a {'whole' if whole else 'finite'} number {limits}")
         return int(value) if whole else float(value)
+
+
+def _show(value: object) -> str:
+    """Return a value as an error message shows it."""
+    try:
+        return repr(value)
+    except (RecursionError, ValueError):  # nested too deeply, or a number of thousands of digits
+        return "..."

@@ -129,6 +129,34 @@ def require_writable(path: Path, kind: str) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
+def require_space(folder: Path, needed: int, purpose: str, of_empty_disk: bool = False) -> None:
+    """Refuse, before any work is done, to write more bytes than the disk has free, or than an empty disk would have.
+
+    Raises
+    ------
+    DataError
+        The message says how much space the purpose needs.
+    """
+    if not is_local(folder):
+        return
+    with _one_line_errors(folder):
+        usage = shutil.disk_usage(folder)
+    space, word = (usage.total, "in all") if of_empty_disk else (usage.free, "free")
+    if needed > space:
+        raise DataError(
+            f"{folder}: {purpose} need about {_format_bytes(needed)}, the disk has {_format_bytes(space)} {word}"
+        )
+
+
+def _format_bytes(count: float) -> str:
+    """Return a number of bytes for people, such as 12.3 MB."""
+    for unit in ("B", "kB", "MB", "GB", "TB"):
+        if count < 1000 or unit == "TB":
+            break
+        count /= 1000
+    return f"{count:.3g} {unit}"
+
+
 def remove_file(path: Path, kind: str) -> None:
     """Remove a file that kpbench wrote as a file of this kind. Ignore a missing file.
 

@@ -32,9 +32,11 @@ GROUND = {
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],
     "signals": [],
-    "pixels": ["errors", "types"],
-    "films": ["errors", "types", "pixels"],
-    "images": ["errors", "types", "files", "writing", "pixels", "films"],
+    "decoding": ["errors", "files"],
+    "hdf5": ["errors", "files", "signals"],
+    "pixels": ["errors", "types", "decoding"],
+    "films": ["errors", "types", "decoding", "pixels"],
+    "images": ["errors", "types", "files", "decoding", "writing", "pixels", "films"],
     "workers": ["errors", "signals"],
     "seeds": [],
     "opencv": ["errors"],
@@ -62,7 +64,7 @@ ROOMS = {
 LAST = "cli"
 """The room that may import every other one, and that no other may import."""
 TORCH_ROOM = "training"
-H5PY_MODULES = {"dataset.shard", "predictions.table_files"}
+H5PY_MODULES = {"hdf5", "dataset.shard", "predictions.table_files"}
 ONNXRUNTIME_ROOMS = {"detectors", TORCH_ROOM}
 HEAVY = {"torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
 """Packages that neither ``import kpbench`` nor ``kpbench --help`` loads."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
+from kpbench.files import encode_utf8
 from kpbench.images import encode_png
 from kpbench.text import escape_markdown
 from kpbench.types import Float, UInt8
@@ -215,7 +216,7 @@ image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
 
 Made with {versions}.
 """
-    write_file(folder / card, text.encode(errors="backslashreplace"))
+    write_file(folder / card, encode_utf8(text))
 
 
 def _markdown_table(histogram: Histogram) -> str:

@@ -25,7 +25,7 @@ from kpbench.images import encode_png
 from kpbench.locks import LOCK_FILE, lock_folder
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
-from kpbench.writing import remove_file, write_file
+from kpbench.writing import remove_file, require_space, write_file
 
 EXPORT_MARK = "kpbench.export/1"
 """Mark in the main file of an export to COCO or YOLO."""
@@ -76,6 +76,7 @@ def export_dataset(
     with lock_folder(make_folder(folder)):
         for part in folder.rglob(".*.part"):  # of a killed run
             part.unlink()
+        require_space(folder, sum(shard.bytes for shard in dataset.shards), f"{len(dataset)} images")
         write_file(mark, content)
         main_file = EXPORT_FORMATS[file_format](dataset, folder, progress)
         write_card(dataset, folder)

@@ -14,16 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.dataset.shard import (
-    DATASET_SCHEMA,
-    canonical_json,
-    encode_utf8,
-    open_shard,
-    read_text_attribute,
-    shard_errors,
-)
+from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, open_shard, shard_errors
 from kpbench.errors import DataError, system_reason
-from kpbench.files import folder_at, is_local, note_read, sha256_of
+from kpbench.files import encode_utf8, folder_at, is_local, load_json, note_read, sha256_of
 from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
@@ -92,7 +85,7 @@ def write_manifest(
 def recorded_digests(folder: Path) -> dict[str, str]:
     """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
     try:
-        shards = json.loads((folder / MANIFEST).read_text("utf-8"))["shards"]
+        shards = load_json((folder / MANIFEST).read_text("utf-8"))["shards"]
         return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
@@ -132,7 +125,7 @@ class Dataset:
         self.provenance: dict[str, Any] = manifest.get("provenance", {})
         self.shards = tuple(ShardEntry(**entry) for entry in manifest["shards"])
         self._starts = np.array([shard.first for shard in self.shards], np.int64)
-        self._files: dict[str, Any] = {}
+        self._files: dict[str, Shard] = {}
         self._process = os.getpid()
 
     def __len__(self) -> int:
@@ -143,7 +136,7 @@ class Dataset:
         state.pop("truth", None)
         return state
 
-    def _open(self, n: int) -> Any:
+    def _open(self, n: int) -> Shard:
         """Return the open file of shard n. If too many shards are open, close the least recently used shard."""
         if self._process != os.getpid():  # after a fork, the open files belong to the parent
             self._files, self._process = {}, os.getpid()
@@ -154,7 +147,7 @@ class Dataset:
         self._files[name] = file  # the last file in the dict is the file used last
         return file
 
-    def _locate(self, index: int) -> tuple[Any, int, Path]:
+    def _locate(self, index: int) -> tuple[Shard, int, Path]:
         """Return the open file that holds an image, the image's row in the file, and the file's path."""
         if not 0 <= index < len(self):
             raise IndexError(f"{self.path} has {len(self)} images, there is no index {index}")
@@ -165,7 +158,7 @@ class Dataset:
         """Return image number ``index``, counted from 0, as a uint8 array of shape (H, W) or (H, W, 3)."""
         file, row, path = self._locate(index)
         with shard_errors(path):
-            return np.asarray(file["images"][row])
+            return file.image(row)
 
     def keypoints(self, index: int) -> NDArray[Any]:
         """Return the true keypoints of image number ``index``, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
@@ -178,7 +171,7 @@ class Dataset:
         """Return the records of the effects that degraded image number ``index``, in the order of application."""
         file, row, path = self._locate(index)
         with shard_errors(path):
-            return list(json.loads(file["degradations"].asstr()[row]))
+            return list(load_json(file["degradations"].asstr()[row]))
 
     def __getitem__(self, index: int) -> tuple[UInt8, NDArray[Any]]:
         return self.image(index), self.keypoints(index)
@@ -230,7 +223,7 @@ class Dataset:
             if digest != shard.sha256:
                 raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
             with open_shard(path) as file, shard_errors(path):
-                count, config = len(file["images"]), read_text_attribute(file, "config")
+                count, config = len(file["images"]), file.texts["config"]
             if count != shard.count:
                 raise DataError(f"{manifest}: {shard.file} has count {shard.count}, expected {count}")
             if config.encode() != encode_utf8(canonical_json(self.config)):
@@ -295,7 +288,7 @@ def _read_manifest(folder: Path) -> Dataset:
     try:
         if is_local(manifest):
             note_read(manifest)
-        content = json.loads(manifest.read_text("utf-8"))
+        content = load_json(manifest.read_text("utf-8"))
         if content["schema"] != DATASET_SCHEMA:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
         shards = [ShardEntry(**entry) for entry in content["shards"]]
@@ -308,7 +301,7 @@ def _read_manifest(folder: Path) -> Dataset:
         raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
         raise DataError(f"{manifest}: cannot be read, {system_reason(error) or error}") from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
         expected = "JSON with schema, config, fingerprint and shards"
         raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None
     if fault:

@@ -8,10 +8,8 @@ merged.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import platform
-import shutil
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
@@ -37,11 +35,11 @@ from kpbench.dataset.resume import (
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
-from kpbench.files import folder_at, is_local, make_folder
+from kpbench.files import folder_at, load_json, make_folder
 from kpbench.locks import lock_folder
 from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.workers import Progress, dask_executor, run_jobs
-from kpbench.writing import remove_leftovers, write_file
+from kpbench.writing import remove_leftovers, require_space, write_file
 
 
 @dataclass(frozen=True)
@@ -121,6 +119,8 @@ def generate(
     """
     with _open_executor(executor, scheduler) as executor:
         folder, written = make_folder(folder_at(out)), config.to_dict()
+        # before a plan of a billion images is made and compared with the folder
+        require_space(folder, config.n * config.image_bytes, f"{config.n} images", of_empty_disk=True)
         plan = plan_shards(config.n, config.shard_size)
         run = _Run(config, folder, written, plan, workers, executor, progress)
         with lock_folder(folder):
@@ -174,6 +174,8 @@ def generate_part(
     >>> len(merge("four"))
     4
     """
+    images = min(config.n, len(shards) * config.shard_size)
+    require_space(make_folder(folder_at(out)), images * config.image_bytes, f"{images} images", of_empty_disk=True)
     plan = plan_shards(config.n, config.shard_size)
     if not (0 <= shards.start < shards.stop <= len(plan)):
         asked, expected = f"{shards.start}:{shards.stop}", f"A:B with 0 <= A < B <= {len(plan)}"
@@ -228,7 +230,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
         present = sorted(folder.glob("shard-*.h5"))
         if not present:
             raise DataError(f"{folder}: no shards there; name the folders of the `parts`")
-        written = json.loads(read_shard_head(present[0]).config)
+        written = load_json(read_shard_head(present[0]).config)
         plan = plan_shards(written["n"], written["shard_size"])
         missing = [n for n, shard in enumerate(plan) if not (folder / shard.file).exists()]
         if missing:
@@ -291,7 +293,8 @@ def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str,
     missing = [shard for shard in run.plan if shard.file not in kept]
     # shards of the same scenes follow each other, so that cached backgrounds are used again
     missing.sort(key=lambda shard: run.config.scene_id(shard.first))
-    _check_space(run.folder, run.config.image_bytes, sum(shard.count for shard in missing))
+    images = sum(shard.count for shard in missing)
+    require_space(run.folder, images * run.config.image_bytes, f"{images} images")
     run.progress(sum(shard.entry.count for shard in kept.values()))
     finished = dict(kept)
     work = partial(_make_shard, run.config, run.written, run.folder.resolve())
@@ -318,27 +321,6 @@ def _finish_dataset(
         dataset = open_dataset(folder)
         write_card(dataset, folder)
     return dataset, broken_files
-
-
-def _check_space(folder: Path, image_bytes: int, images: int) -> None:
-    """Raise an error if the disk has too little space for the images."""
-    if not is_local(folder):
-        return
-    needed = images * image_bytes
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise DataError(
-            f"{folder}: {images} images need about {_format_bytes(needed)}, the disk has {_format_bytes(free)} free"
-        )
-
-
-def _format_bytes(count: float) -> str:
-    """Return a number of bytes for people, such as 12.3 MB."""
-    for unit in ("B", "kB", "MB", "GB", "TB"):
-        if count < 1000 or unit == "TB":
-            break
-        count /= 1000
-    return f"{count:.3g} {unit}"
 
 
 def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,11 +11,13 @@ from typing import Any
 
 from kpbench.dataset.card import CARD_FILES
 from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
-from kpbench.dataset.shard import canonical_json, open_shard, read_text_attribute
+from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
-from kpbench.files import sha256_of
+from kpbench.files import load_json, sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers
 
+MOST_SHARDS = 4_000_000
+"""Largest number of shards of a dataset."""
 LONGEST_VALUE = 40
 """An error message shows two different values of a key only if each value has fewer characters than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
@@ -52,6 +53,8 @@ class ShardHead:
 def plan_shards(n: int, shard_size: int) -> list[PlannedShard]:
     """List all shards of a dataset of n images."""
     firsts = range(0, n, shard_size)
+    if len(firsts) > MOST_SHARDS:
+        raise DataError(f"`n` is {n}: {len(firsts)} shards of {shard_size} images, expected at most {MOST_SHARDS}")
     return [PlannedShard(f"shard-{k:05d}.h5", first, min(shard_size, n - first)) for k, first in enumerate(firsts)]
 
 
@@ -141,7 +144,7 @@ def find_finished_shards(
             continue
         head = read_shard_head(path)
         if head.config != canonical_json(config) or head.images != range(planned.first, planned.first + planned.count):
-            difference = first_difference(json.loads(head.config), config)
+            difference = first_difference(load_json(head.config), config)
             raise DataError(f"{path}: of another dataset{difference}{remedy}")
         entry = ShardEntry(planned.file, planned.first, planned.count, path.stat().st_size, sha256_of(path))
         if digests.get(planned.file, entry.sha256) != entry.sha256:
@@ -154,8 +157,8 @@ def read_shard_head(path: Path) -> ShardHead:
     """Open a shard, and return the facts that tell to which dataset and to which place in it the shard belongs."""
     with open_shard(path) as file:
         ids = file["image_id"][:]
-        broken_files = tuple(json.loads(read_text_attribute(file, "broken_backgrounds")))
-        return ShardHead(read_text_attribute(file, "config"), broken_files, range(int(ids[0]), int(ids[-1]) + 1))
+        broken_files = tuple(load_json(file.texts["broken_backgrounds"]))
+        return ShardHead(file.texts["config"], broken_files, range(int(ids[0]), int(ids[-1]) + 1))
 
 
 def first_difference(found: dict[str, Any], expected: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -19,26 +20,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, system_reason
-from kpbench.files import is_local, note_read
-from kpbench.locks import open_with_lock_if_possible
+from kpbench.files import encode_utf8
+from kpbench.hdf5 import Column, Layout, open_hdf5
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
 """Level of libdeflate, which always gives the same bytes for the same input. ISA-L, zlib-ng and zlib-rs may not."""
-MOST_INFLATION = 1100
-"""Largest accepted ratio of unpacked to packed bytes. Deflate reaches at most 1032."""
-SHARD_COLUMNS = (
-    "images",
-    "image_id",
-    "scene_id",
-    "condition",
-    "rung",
-    "offsets",
-    "keypoints",
-    "degradations",
-    "background",
-)
+_INT, _FLOAT = Column(np.dtype("<i8"), ("fletcher32",)), Column(np.dtype("<f8"), ("fletcher32",))
+_TEXT = Column("S", ("gzip", "fletcher32"))
+SHARD_COLUMNS = {
+    "images": Column(np.dtype("u1"), ("gzip",), ndim=(3, 4), is_large=True),
+    "image_id": _INT,
+    "scene_id": _INT,
+    "condition": _TEXT,
+    "rung": _FLOAT,
+    "offsets": _INT,
+    "keypoints": Column(KEYPOINT_DTYPE, ("fletcher32",)),
+    "degradations": _TEXT,
+    "background": _TEXT,
+}
+SHARD_TEXTS = ("schema", "config", "broken_backgrounds")
 
 
 @dataclass(frozen=True)
@@ -188,50 +190,81 @@ def shard_errors(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: damaged or no kpbench shard ({' '.join(str(error).split())[:160]})") from None
 
 
-def read_text_attribute(file: Any, name: str) -> str:
-    """Return a text attribute of an open shard."""
-    return np.bytes_(file.attrs[name]).decode()
+class Shard:
+    """An open shard, made by :func:`open_shard`. ``shard[name]`` is a column as an HDF5 dataset.
+
+    Attributes
+    ----------
+    texts : dict of str to str
+        The attributes ``schema``, ``config`` and ``broken_backgrounds``.
+    """
+
+    def __init__(self, file: Any, texts: dict[str, str]) -> None:
+        self._file, self.texts = file, texts
+        self._images = file["images"]
+        self._image_bytes = math.prod(self._images.shape[1:])
+
+    def __getitem__(self, name: str) -> Any:
+        return self._file[name]
+
+    def __enter__(self) -> Shard:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def image(self, row: int) -> UInt8:
+        """Return an image. HDF5 would unpack however much a chunk holds, this unpacks one image.
+
+        Raises
+        ------
+        ValueError
+            If the chunk is damaged or holds more or less than an image.
+        """
+        shape = self._images.shape[1:]
+        _, packed = self._images.id.read_direct_chunk((row, *(0 for _ in shape)))
+        try:
+            pixels = np.frombuffer(deflate.zlib_decompress(packed, self._image_bytes), np.uint8)
+        except deflate.DeflateError as error:
+            raise ValueError(f"image {row} cannot be unpacked, {error}") from None
+        if len(pixels) != self._image_bytes:
+            raise ValueError(f"image {row} has {len(pixels)} bytes, expected {self._image_bytes}")
+        return pixels.reshape(shape)
 
 
-def open_shard(path: Path) -> Any:
+def open_shard(path: Path) -> Shard:
     """Open a shard. Check that all data lie in the file itself and have a plausible size.
-
-    Returns
-    -------
-    h5py.File
 
     Raises
     ------
     DataError
         If the file is damaged or has another schema. If the file needs external links, external storage, virtual
-        datasets, or filters that are not built into HDF5.
+        datasets, or other filters than kpbench writes.
     """
     with shard_errors(path):
-        if is_local(path):
-            note_read(path)
-        file = open_with_lock_if_possible(h5py.File, path) if is_local(path) else h5py.File(path.open("rb"), "r")
-    try:
-        with shard_errors(path):
-            _check_shard(file, path.stat().st_size)
-    except BaseException:
-        file.close()
-        raise
-    return file
+        file, texts = open_hdf5(path, Layout(SHARD_COLUMNS, SHARD_TEXTS, has_others=True))
+        try:
+            _check_shard(file, texts)
+            return Shard(file, texts)
+        except BaseException:
+            file.close()
+            raise
 
 
-def _check_shard(file: Any, file_bytes: int) -> None:
+def _check_shard(file: Any, texts: Mapping[str, str]) -> None:
     """Raise ValueError if :func:`open_shard` must refuse an open shard."""
-    schema = read_text_attribute(file, "schema")
-    if schema != DATASET_SCHEMA:
-        raise ValueError(f"schema is {schema!r}, expected {DATASET_SCHEMA!r}")
-    for name in SHARD_COLUMNS:
-        _check_storage(file, name, file_bytes)
+    if texts["schema"] != DATASET_SCHEMA:
+        raise ValueError(f"schema is {texts['schema']!r}, expected {DATASET_SCHEMA!r}")
+    if missing := [name for name in SHARD_TEXTS if name not in texts]:
+        raise ValueError(f"has no attribute {missing[0]}")
     images = file["images"]
-    if images.dtype != np.uint8 or images.ndim not in (3, 4):
-        raise ValueError(f"/images is {images.dtype} of shape {images.shape}, expected uint8 (N,H,W) or (N,H,W,3)")
-    if file["keypoints"].dtype != KEYPOINT_DTYPE:
-        raise ValueError("/keypoints has other columns than this version of kpbench knows")
-    count = images.shape[0]
+    count, *shape = images.shape
+    if shape[2:] not in ([], [3]) or images.chunks != (1, *shape) or images.compression != "gzip":
+        raise ValueError(f"/images has the shape {images.shape}, expected (N,H,W) or (N,H,W,3), a gzip chunk per image")
     for name in SHARD_COLUMNS:
         expected = (count + (name == "offsets"),)
         if name not in ("images", "keypoints") and file[name].shape != expected:
@@ -239,25 +272,3 @@ def _check_shard(file: Any, file_bytes: int) -> None:
     offsets = file["offsets"][:]
     if offsets[0] != 0 or offsets[-1] != len(file["keypoints"]) or np.any(np.diff(offsets) < 0):
         raise ValueError("/offsets does not fit /keypoints")
-
-
-def _check_storage(file: Any, name: str, file_bytes: int) -> None:
-    """Raise ValueError if a column is stored outside the file, or declares more data than its bytes can hold."""
-    if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-        raise ValueError(f"/{name} is missing or a link to elsewhere")
-    data = file[name]
-    if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external or data.dtype.hasobject:
-        raise ValueError(f"/{name} is not plain data stored in this file")
-    creation = data.id.get_create_plist()
-    filters = {creation.get_filter(n)[0] for n in range(creation.get_nfilters())}
-    if not filters <= {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_FLETCHER32}:
-        raise ValueError(f"/{name} uses a filter that HDF5 does not have built in")
-    stored = data.id.get_storage_size()
-    most = MOST_INFLATION * stored if h5py.h5z.FILTER_DEFLATE in filters else min(stored, file_bytes)
-    if data.nbytes > most:
-        raise ValueError(f"/{name} declares {data.nbytes} bytes, the file holds {stored} for it")
-
-
-def encode_utf8(text: str) -> bytes:
-    """Encode text as UTF-8. Bytes of file names that are not valid text are escaped as in JSON."""
-    return text.encode(errors="backslashreplace")

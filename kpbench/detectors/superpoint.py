@@ -8,7 +8,6 @@ centre of mass of the probability in a window around a local maximum. The window
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +21,7 @@ from kpbench.detectors.inference import open_session, runs_on_gpu
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
 from kpbench.errors import DataError, system_reason
-from kpbench.files import note_read
+from kpbench.files import load_json, note_read
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
 from kpbench.toml import TomlTable, name_source
@@ -257,7 +256,7 @@ class SuperPointDetector:
         try:
             note_read(self.path)
             self._session, text = open_session(self.path.read_bytes(), self.threads)
-            content = json.loads(text or "{}")
+            content = load_json(text or "{}")
         except DataError:
             raise
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public

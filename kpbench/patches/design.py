@@ -27,6 +27,8 @@ from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.types import Float
 
 SCHEMA = "kpbench.patch/1"
+SEMICIRCLES_LIMIT = 100
+"""Largest number of semi-circles of a design: its cells grow with the square of the number."""
 INKS = ("black", "white", "invert")
 PATCH_KEYS = ("schema", "name", "id", "disc", "semicircles", "rim", "quiet_zone")
 
@@ -230,7 +232,7 @@ def parse_patch(content: Mapping[str, Any], source: str) -> Patch:
                     entry.number("start_deg", -360.0, 360.0),
                     entry.choice("ink", INKS),
                 )
-                for entry in table.tables("semicircles", ("radius", "start_deg", "ink"))
+                for entry in table.tables("semicircles", ("radius", "start_deg", "ink"), SEMICIRCLES_LIMIT)
             ),
             rim=rim.number("width", 0.0, 2.0, 0.0),
             rim_ink=rim.choice("ink", ("black", "white"), "white"),

@@ -7,7 +7,6 @@ piece is decoded again into plain objects. The second decoding finds the place o
 from __future__ import annotations
 
 import gc
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from kpbench.errors import PredictionsError
+from kpbench.files import load_json
 
 PIECE_BYTES = 4 * 2**20
 """Bytes of JSON that are decoded at a time."""
@@ -100,7 +100,7 @@ def decode_records(
             batch: list[Record] = decoder.decode(piece)
         except (ValueError, RecursionError):
             first = start
-            batch = convert_records(json.loads(piece), record, expected, lambda n: place(first + n))  # noqa: B023
+            batch = convert_records(load_json(piece), record, expected, lambda n: place(first + n))  # noqa: B023
         yield batch
         start += len(batch)
 
@@ -150,8 +150,8 @@ def parse_json(data: bytes, place: str) -> Any:
     except (ValueError, RecursionError) as error:
         problem = str(error)
     try:
-        return json.loads(data)
-    except (ValueError, RecursionError):
+        return load_json(data)
+    except ValueError:
         raise PredictionsError(f"{place} is cut off or no JSON ({problem})") from None
 
 
@@ -163,7 +163,10 @@ def json_type(value: object) -> str:
 
 def abbreviate(value: object) -> str:
     """Write a value with at most 60 characters."""
-    text = repr(value)
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # nested deeply, or a number of thousands of digits
+        return "..."
     return text if len(text) <= 60 else text[:57] + "..."
 
 

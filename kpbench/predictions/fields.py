@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import msgspec
 
 from kpbench.errors import PredictionsError
+from kpbench.files import escape_surrogates
 from kpbench.predictions.decode import json_type
 from kpbench.types import Predictions
 
@@ -68,4 +69,5 @@ def parse_header(content: Any) -> dict[str, Any]:
 def make_header(predictions: Predictions) -> dict[str, Any]:
     """Return the header of predictions as a dict for JSON."""
     named = {"dataset": predictions.dataset, "fingerprint": predictions.fingerprint}
-    return {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}
+    header = {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}
+    return dict(escape_surrogates(header))

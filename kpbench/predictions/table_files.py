@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import KpbenchWarning, PredictionsError, system_reason
-from kpbench.locks import open_with_lock_if_possible
 from kpbench.predictions.decode import Place, abbreviate, parse_json
 from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
 from kpbench.text import escape_csv_comment
@@ -25,8 +24,12 @@ from kpbench.types import Predictions, offsets_of
 
 ID_LIMITS = {"image_id": 2**63, "id": 2**53}
 """Columns of whole numbers, and the least number that each cannot hold."""
-LARGEST_RATIO = 1100
-"""Largest accepted compression ratio of HDF5 data. Gzip reaches at most 1032."""
+ROOM_BYTES, MOST_EXPANSION = 2**26, 1100
+"""A Parquet file may declare so many bytes of numbers, and so many more per byte of the file."""
+MOST_COLUMNS = 100
+"""Largest number of columns of a Parquet file."""
+H5_FILTERS = ("shuffle", "gzip", "fletcher32")
+"""HDF5 filters that columns may use."""
 
 
 def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], place: Place) -> Predictions:
@@ -252,6 +255,15 @@ def read_parquet(path: Path) -> Predictions:
     """
     pa, pq = _import_pyarrow()
     try:
+        described = pq.read_metadata(path)
+        # plain numbers need 8 bytes per cell; Parquet's own counts may say anything
+        declared = max(8 * described.num_rows * described.num_columns, _unpacked_bytes(described))
+        most = ROOM_BYTES + MOST_EXPANSION * path.stat().st_size
+        if not 0 <= declared <= most or described.num_columns > MOST_COLUMNS:
+            raise PredictionsError(
+                f"declares {described.num_rows} rows, {described.num_columns} columns and {declared} bytes, "
+                f"expected at most {MOST_COLUMNS} columns and {most} bytes in a file of this size"
+            )
         table = pq.read_table(path)
     except (pa.ArrowException, ValueError) as error:
         raise PredictionsError(f"damaged or no Parquet file ({' '.join(str(error).split())[:120]})") from None
@@ -269,6 +281,12 @@ def read_parquet(path: Path) -> Predictions:
         except (pa.ArrowException, ValueError) as error:
             raise PredictionsError(f"column {name} holds no plain numbers ({str(error)[:80]})") from None
     return build_predictions(columns, header, lambda row: f"row {row}")
+
+
+def _unpacked_bytes(described: Any) -> int:
+    """Return how many bytes the columns of a Parquet file say that they have when they are unpacked."""
+    groups = (described.row_group(n) for n in range(described.num_row_groups))
+    return sum(group.column(k).total_uncompressed_size for group in groups for k in range(group.num_columns))
 
 
 def _import_pyarrow() -> tuple[Any, Any]:
@@ -300,49 +318,33 @@ def read_h5(path: Path) -> Predictions:
     PredictionsError
         At the first fault, or if data is stored outside the file.
     """
-    import h5py
+    from kpbench.hdf5 import Column, Layout, StructureError, open_hdf5
 
-    columns: dict[str, NDArray[Any]] = {}
+    columns = {
+        name: Column("iu" if kind == "i" else "fiu", H5_FILTERS, (1 + (name == "xy"),), name in ("score", "id"))
+        for name, kind in H5_COLUMNS.items()
+    }
     try:
-        with open_with_lock_if_possible(h5py.File, path) as file:
-            header = {}
-            if "header" in file.attrs:
-                header = parse_header(parse_json(_to_bytes(file.attrs["header"]), "the attribute header"))
-            for name in sorted(set(file) - H5_COLUMNS.keys()):
-                raise PredictionsError(f"unknown dataset /{name}, expected {', '.join(H5_COLUMNS)}")
-            for name, kind in H5_COLUMNS.items():
-                if name not in file and name in ("score", "id"):
-                    continue
-                if not isinstance(file.get(name, getlink=True), h5py.HardLink):
-                    raise PredictionsError(f"/{name} is missing or a link to elsewhere")
-                data = file[name]
-                # A file may refer to other files of this machine, or declare more data than it holds
-                if not isinstance(data, h5py.Dataset) or data.is_virtual or data.external:
-                    raise PredictionsError(f"/{name} is not stored in this file")
-                if data.nbytes > LARGEST_RATIO * data.id.get_storage_size():
-                    raise PredictionsError(f"/{name} declares {data.nbytes} bytes, the file holds fewer")
-                if data.dtype.kind not in (kind + "u" if kind == "i" else "fi") or data.ndim != 1 + (name == "xy"):
-                    raise PredictionsError(f"/{name} is {data.dtype} of shape {data.shape}, expected {kind}8 columns")
-                columns[name] = data[:]
+        file, texts = open_hdf5(path, Layout(columns, ("header",), has_variable_texts=True))
+        with file:
+            table = {name: file[name][:] for name in columns if name in file}
+    except StructureError as error:
+        raise PredictionsError(str(error)) from None
     except (OSError, KeyError, ValueError, RuntimeError, TypeError) as error:
         if reason := system_reason(error):
             raise PredictionsError(f"cannot be read, {reason}") from None
         raise PredictionsError(f"damaged or no HDF5 file ({' '.join(str(error).split())[:120]})") from None
-    if columns["xy"].shape[1:] != (2,):
-        raise PredictionsError(f"/xy has shape {columns['xy'].shape}, expected (K, 2)")
+    header = parse_header(parse_json(texts["header"].encode(), "the attribute header")) if texts else {}
+    if table["xy"].shape[1:] != (2,):
+        raise PredictionsError(f"/xy has shape {table['xy'].shape}, expected (K, 2)")
     return Predictions(
-        image_id=columns["image_id"],
-        offsets=columns["offsets"],
-        xy=columns["xy"],
-        score=columns.get("score", np.ones(len(columns["xy"]))),
-        patch_id=columns.get("id"),
+        image_id=table["image_id"],
+        offsets=table["offsets"],
+        xy=table["xy"],
+        score=table.get("score", np.ones(len(table["xy"]))),
+        patch_id=table.get("id"),
         **header,
     )
-
-
-def _to_bytes(text: object) -> bytes:
-    """Return the text of an HDF5 attribute: h5py gives bytes for text of fixed length, else str."""
-    return text if isinstance(text, bytes) else str(text).encode()
 
 
 def encode_h5(predictions: Predictions) -> bytes:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
+from kpbench.files import encode_utf8
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
 from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.score_charts import (
@@ -343,7 +344,7 @@ def write_report(path: str | Path, report: Report) -> None:
     """
     path = Path(path)
     require_report_suffix(path)
-    write_file(path, _add_mark(path.suffix.lower(), REPORT_WRITERS[path.suffix.lower()](report)).encode())
+    write_file(path, encode_utf8(_add_mark(path.suffix.lower(), REPORT_WRITERS[path.suffix.lower()](report))))
 
 
 def require_report_suffix(path: Path) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from kpbench import __version__
-from kpbench.files import sha256_of
+from kpbench.files import encode_utf8, escape_surrogates, sha256_of
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import Comparison
@@ -56,7 +56,7 @@ def encode_comparisons(comparisons: Sequence[Comparison], provenance: Mapping[st
 
 
 def _encode_json(content: Mapping[str, Any]) -> bytes:
-    return msgspec.json.format(msgspec.json.encode(content), indent=2) + b"\n"
+    return msgspec.json.format(msgspec.json.encode(escape_surrogates(content)), indent=2) + b"\n"
 
 
 def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
@@ -76,4 +76,4 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return text.getvalue().encode()
+    return encode_utf8(text.getvalue())

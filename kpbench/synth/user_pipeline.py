@@ -31,7 +31,7 @@ LEAST_IMAGE_SHARE = 0.999
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
-LONGEST_YAML_VALUE = 1000
+LONGEST_SCALAR = 1000
 """Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
 
 
@@ -79,8 +79,8 @@ def _parse_yaml(text: str) -> Any:
     # A few lines of aliases of aliases stand for millions of values. albumentations.save writes no alias.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in Python needs seconds for some small files
     for event in yaml.parse(text, loader):
-        if isinstance(event, yaml.AliasEvent) or len(getattr(event, "value", "")) > LONGEST_YAML_VALUE:
-            raise ValueError(f"it has an alias (*name), or a value of over {LONGEST_YAML_VALUE} characters")
+        if isinstance(event, yaml.AliasEvent) or len(getattr(event, "value", "")) > LONGEST_SCALAR:
+            raise ValueError(f"it has an alias (*name), or a value of over {LONGEST_SCALAR} characters")
     return yaml.load(text, loader)
 
 

@@ -166,10 +166,10 @@ def test_a_shard_that_reaches_outside_itself_is_refused(tmp_path, whole):
         file["images"] = h5py.ExternalLink(str(whole / "shard-00000.h5"), "/images")
 
     assert "a link to elsewhere" in replaced("link", link)
-    assert "declares 1000000000000 bytes" in replaced(
+    assert "/images has 0 chunks, expected 40000" in replaced(
         "huge", lambda f: f.create_dataset("images", (4, 500000, 500000), "u1", chunks=(1, 5000, 5000), compression=1)
     )
-    assert "filter that HDF5 does not have built in" in replaced(
+    assert "filters number 32000, expected at most gzip, each once" in replaced(
         "filter", lambda f: f.create_dataset("images", shape, "u1", chunks=shape, compression="lzf")
     )
 

@@ -349,9 +349,9 @@ def schema(file):
     ("change", "problem"),
     [
         (elsewhere, "/xy is missing or a link to elsewhere"),
-        (virtual, "/xy is not stored in this file"),
-        (external, "/xy is not stored in this file"),
-        (bomb, "/score declares 8000000000000 bytes, the file holds fewer"),
+        (virtual, "/xy is not plain data stored in this file"),
+        (external, "/xy is not plain data stored in this file"),
+        (bomb, "/score declares 8000000000000 bytes, the file holds 0 for it"),
         (renamed, "unknown dataset /scores, expected image_id, offsets, xy, score, id"),
         (text, "/score is object of shape"),
         (broken_offsets, "offsets do not run from 0 to"),
