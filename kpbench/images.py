@@ -109,7 +109,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
     if isinstance(image, Film):
         return _source_of(image, source)
     if isinstance(image, str):
-        raise DataError(f"{path}: {image}{' as an image' if image == UNDECODABLE else ''}")
+        raise DataError(f"{path}: {image}{' as an image of at most 200 megapixels' if image == UNDECODABLE else ''}")
     return ImageSource(iter([(path.name, image)]), 1)
 
 

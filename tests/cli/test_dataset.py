@@ -94,4 +94,4 @@ def test_a_full_standard_output_is_one_line(dataset):
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False, env=buffered)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
-    assert done.stderr == "kpbench: No space left on device\n"
+    assert done.stderr == "kpbench: the disk is full\n"
