@@ -6,7 +6,10 @@ reads when it is loaded.
 
 from __future__ import annotations
 
+import io
 import os
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ from kpbench.errors import DataError
 from kpbench.files import note_read
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MOST_PIXELS_PER_BYTE = 50_000
+"""Largest number of pixels of all frames of an animation, per byte of its file. Films have a few pixels per byte."""
 
 
 def read_bytes(path: Path) -> NDArray[np.uint8] | None:
@@ -31,7 +36,7 @@ def read_bytes(path: Path) -> NDArray[np.uint8] | None:
 
 def decode_image(data: NDArray[np.uint8] | None, flags: int) -> NDArray[Any] | None:
     """Return the image that ``cv2.imdecode`` makes of a file's content; None if the content cannot be decoded."""
-    if data is None or not len(data) or not _has_whole_chunks(data):
+    if data is None or not len(data) or not _is_whole(data):
         return None
     try:
         return cv2.imdecode(data, flags)
@@ -39,17 +44,64 @@ def decode_image(data: NDArray[np.uint8] | None, flags: int) -> NDArray[Any] | N
         return None
 
 
-def _has_whole_chunks(data: NDArray[np.uint8]) -> bool:
-    """Return whether all chunks of a PNG file end within the file. OpenCV reserves memory for what a chunk declares."""
-    if data[:8].tobytes() != PNG_SIGNATURE:
-        return True
-    at = len(PNG_SIGNATURE)
-    while at + 8 <= len(data):
-        length, kind = int.from_bytes(data[at : at + 4].tobytes(), "big"), data[at + 4 : at + 8].tobytes()
-        at += 12 + length
+def _is_whole(data: NDArray[np.uint8]) -> bool:
+    """Return whether the pixels of a PNG, JPEG or GIF file end within the file. OpenCV fills up what is missing."""
+    content = data.tobytes()
+    if content.startswith(PNG_SIGNATURE):
+        return _is_whole_png(content)
+    if content.startswith(b"\xff\xd8\xff"):  # the end of the image comes after the last start of a scan
+        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
+    return not content.startswith((b"GIF87a", b"GIF89a")) or _is_whole_gif(content)
+
+
+def _is_whole_png(content: bytes) -> bool:
+    """Check that all chunks end within the file, the checksums, and the number of bytes of the pixels (ISO 15948)."""
+    at, header, unpack, count = len(PNG_SIGNATURE), b"", zlib.decompressobj(), 0
+    while at + 8 <= len(content):
+        length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
+        chunk, checksum = content[at + 8 : at + 8 + length], content[at + 8 + length : at + 12 + length]
         if kind == b"IEND":
             break
-    return at <= len(data)
+        if len(checksum) < 4:  # OpenCV reserves memory for what a chunk declares
+            return False
+        if kind in (b"IHDR", b"PLTE", b"IDAT") and zlib.crc32(kind + chunk) != int.from_bytes(checksum, "big"):
+            return False
+        header = header or chunk
+        if kind == b"IDAT":
+            try:
+                while chunk and not unpack.eof:
+                    count += len(unpack.decompress(chunk, 2**22))
+                    chunk = unpack.unconsumed_tail
+            except zlib.error:
+                return False
+        at += 12 + length
+    return len(header) == 13 and count >= _png_bytes(header)
+
+
+def _png_bytes(header: bytes) -> int:
+    """Return the number of bytes of the pixels of a PNG file, unpacked: each row has a byte for its filter."""
+    width, height, bits, colour, _, _, interlaced = struct.unpack(">IIBBBBB", header)
+    samples = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}.get(colour, 4)
+    # (first column, first row, step of columns, step of rows) of each pass of Adam7
+    passes = [(0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2)]
+    total = 0
+    for x, y, dx, dy in passes if interlaced else [(0, 0, 1, 1)]:
+        columns, rows = -(-(width - x) // dx), -(-(height - y) // dy)
+        total += rows * (1 + -(-columns * bits * samples // 8)) if columns > 0 and rows > 0 else 0
+    return total
+
+
+def _is_whole_gif(content: bytes) -> bool:
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(content)) as image:
+            if image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
+                return False
+            image.load()
+    except Exception:  # Pillow's plugins raise errors of many classes
+        return False
+    return True
 
 
 def require_opencv_name(path: Path) -> None:

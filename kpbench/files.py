@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
 import re
@@ -89,7 +88,7 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
             data = file.read(LARGEST_TEXT + 1)
         if len(data) > LARGEST_TEXT:
             raise error(f"{path}: has more than {LARGEST_TEXT} bytes, too many for such a file")
-        return io.TextIOWrapper(io.BytesIO(data), "utf-8").read()
+        return data.decode()
     except OSError as problem:
         raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
     except UnicodeDecodeError:

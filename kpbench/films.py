@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.decoding import require_opencv_name
+from kpbench.decoding import MOST_PIXELS_PER_BYTE, require_opencv_name
 from kpbench.errors import DataError, KpbenchWarning
 from kpbench.pixels import lay_on_white, png_chunk
 from kpbench.types import UInt8
@@ -169,6 +169,11 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
         return None
     if length < 2:
         return None
+    if length * image.width * image.height > MOST_PIXELS_PER_BYTE * len(data):
+        raise DataError(
+            f"{path}: declares {length} frames of {image.width} x {image.height} in {len(data)} bytes, "
+            f"expected at most {MOST_PIXELS_PER_BYTE} pixels per byte"
+        )
     if is_gif and not data[-64:].tobytes().rstrip(b"\0").endswith(b";"):
         warnings.warn(f"{path}: is cut off after frame {length - 1}", KpbenchWarning, stacklevel=2)
 

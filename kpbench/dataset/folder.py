@@ -224,6 +224,9 @@ class Dataset:
                 raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
             with open_shard(path) as file, shard_errors(path):
                 count, config = len(file["images"]), file.texts["config"]
+                keypoints = file["keypoints"][:]
+            if not all(np.isfinite(keypoints[name]).all() for name in ("x", "y", "radius_major", "H_patch2image")):
+                raise DataError(f"{path}: a keypoint has a value that is no finite number")
             if count != shard.count:
                 raise DataError(f"{manifest}: {shard.file} has count {shard.count}, expected {count}")
             if config.encode() != encode_utf8(canonical_json(self.config)):

@@ -311,9 +311,14 @@ class SuperPointDetector:
         """Return the logits of the two heads, (B, 65, h, w) and (B, ids + 1, h, w), for B grey images of one size."""
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         try:
-            return self._session.run(None, {"image": blob})
+            outputs: list[Float32] = list(self._session.run(None, {"image": blob}))
         except Exception as error:  # as above
             raise DataError(f"{self.path}: the network cannot be run ({_first_line(error)})") from None
+        shape = (len(greys), -1, blob.shape[2] // CELL_PX, blob.shape[3] // CELL_PX)
+        for output, channels in zip(outputs, (CELL_PX**2 + 1, len(self.patches) + 1), strict=False):
+            if output.shape != (shape[0], channels, *shape[2:]):
+                raise DataError(f"{self.path}: an output has the shape {output.shape}, expected {channels} channels")
+        return outputs
 
     def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
         """Return the candidates of the network, for each of several grey images of one size.

@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
 from kpbench.files import note_read, path_below
-from kpbench.predictions.decode import convert_records, decode_records, json_type, parse_json, pause_gc, split_list
+from kpbench.predictions.decode import (
+    convert_records,
+    decode_records,
+    json_type,
+    parse_json,
+    pause_gc,
+    require_utf8,
+    split_list,
+)
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
@@ -186,6 +194,7 @@ def open_coco(path: str | Path) -> CocoDataset:
     try:
         note_read(path)
         data = path.read_bytes()
+        require_utf8(data)
         with pause_gc():
             content = _decode_annotations(data)
             truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
@@ -289,12 +298,13 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
             )
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
-    valid |= ~labelled
+    valid &= (table["radius_major"] > 0) & (table["radius_minor"] > 0)
+    valid |= ~labelled & np.isfinite(points[:, 2])
     if not valid.all():
         n = int(np.argmin(valid))
         raise DataError(
             f"annotations[{n}] (image_id {annotations[n].image_id}): keypoints are {points[n].tolist()} and the radius "
-            f"is {table['radius_major'][n]}, expected finite numbers"
+            f"is {table['radius_major'][n]}, expected finite numbers and a radius over 0"
         )
     return table, labelled
 
@@ -325,6 +335,7 @@ def decode_coco_results(data: bytes) -> Predictions:
     PredictionsError
         At the first entry with a fault. The message names the entry and the image.
     """
+    require_utf8(data)
 
     def place(n: int) -> str:
         return f"results[{n}]"

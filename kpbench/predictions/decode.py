@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from kpbench.errors import PredictionsError
-from kpbench.files import load_json
+from kpbench.files import escape_surrogates, load_json
 
 PIECE_BYTES = 4 * 2**20
 """Bytes of JSON that are decoded at a time."""
@@ -116,6 +116,8 @@ def convert_records(entries: list[Any], record: type[Record], expected: Expected
     """
     try:
         return msgspec.convert(entries, list[record])  # type: ignore[valid-type]
+    except UnicodeEncodeError:  # a key holds half of a character, which msgspec cannot compare
+        return convert_records(escape_surrogates(entries), record, expected, place)
     except msgspec.ValidationError as error:
         problem, _, path = str(error).rpartition(" - at `$")
     n, *steps = (int(index) if index else name for index, name in re.findall(r"\[(\d+)\]|\.(\w+)", path))
@@ -124,7 +126,7 @@ def convert_records(entries: list[Any], record: type[Record], expected: Expected
         raise PredictionsError(f"{place(n)} is {json_type(entry)}, expected an object")
     where = f"{place(n)} (image_id {abbreviate(entry['image_id'])})" if "image_id" in entry else place(n)
     if not steps:
-        fault, name = re.findall("(missing|unknown).* field `(.*)`", problem)[0]
+        fault, name = re.findall("(missing|unknown).* field `(.*)`", problem, re.DOTALL)[0]
         if fault == "missing":
             raise PredictionsError(f"{where}: no {name}, expected {expected[name]}")
         raise PredictionsError(
@@ -153,6 +155,19 @@ def parse_json(data: bytes, place: str) -> Any:
         return load_json(data)
     except ValueError:
         raise PredictionsError(f"{place} is cut off or no JSON ({problem})") from None
+
+
+def require_utf8(data: bytes) -> None:
+    """Refuse bytes that are not UTF-8 text. msgspec does not look at the texts that it skips.
+
+    Raises
+    ------
+    PredictionsError
+    """
+    try:
+        data.decode()
+    except UnicodeDecodeError as error:
+        raise PredictionsError(f"byte {error.start} is not UTF-8 text") from None
 
 
 def json_type(value: object) -> str:

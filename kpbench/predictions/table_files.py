@@ -271,10 +271,13 @@ def read_parquet(path: Path) -> Predictions:
     header = parse_header(parse_json(metadata[b"kpbench"], "the metadata")) if b"kpbench" in metadata else {}
     names = _check_columns(table.column_names, "the table")
     columns = {}
-    for name in names:
+    for position, name in enumerate(names):
         is_whole = name == "image_id"
         try:
-            column = table.column(name).cast(pa.int64() if is_whole else pa.float64())
+            stored = table.column(position)
+            if not (pa.types.is_integer(stored.type) or pa.types.is_floating(stored.type)):
+                raise ValueError(f"it has the type {stored.type}")
+            column = stored.cast(pa.int64() if is_whole else pa.float64())
             if is_whole and column.null_count:
                 raise ValueError("it has nulls")
             columns[name] = column.to_numpy()
