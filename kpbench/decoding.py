@@ -21,7 +21,7 @@ from kpbench.errors import DataError
 from kpbench.files import note_read
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MOST_PIXELS_PER_BYTE = 50_000
+MOST_PIXELS_PER_BYTE = 5_000
 """Largest number of pixels of all frames of an animation, per byte of its file. Films have a few pixels per byte."""
 
 
@@ -48,14 +48,15 @@ def _is_whole(data: NDArray[np.uint8]) -> bool:
     """Return whether the pixels of a PNG, JPEG or GIF file end within the file. OpenCV fills up what is missing."""
     content = data.tobytes()
     if content.startswith(PNG_SIGNATURE):
-        return _is_whole_png(content)
-    if content.startswith(b"\xff\xd8\xff"):  # the end of the image comes after the last start of a scan
-        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
-    return not content.startswith((b"GIF87a", b"GIF89a")) or _is_whole_gif(content)
+        return is_whole_png(content)
+    return not content.startswith((b"\xff\xd8\xff", b"GIF87a", b"GIF89a")) or _is_whole_for_pillow(content)
 
 
-def _is_whole_png(content: bytes) -> bool:
-    """Check that all chunks end within the file, the checksums, and the number of bytes of the pixels (ISO 15948)."""
+def is_whole_png(content: bytes, first_frame_alone: bool = False) -> bool:
+    """Check that all chunks end within the file, the checksums, and the number of bytes of the pixels (ISO 15948).
+
+    With ``first_frame_alone``, the file may end after the pixels of the first frame.
+    """
     at, header, unpack, count = len(PNG_SIGNATURE), b"", zlib.decompressobj(), 0
     while at + 8 <= len(content):
         length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
@@ -63,6 +64,8 @@ def _is_whole_png(content: bytes) -> bool:
         if kind == b"IEND":
             break
         if len(checksum) < 4:  # OpenCV reserves memory for what a chunk declares
+            if first_frame_alone:
+                break
             return False
         if kind in (b"IHDR", b"PLTE", b"IDAT") and zlib.crc32(kind + chunk) != int.from_bytes(checksum, "big"):
             return False
@@ -91,12 +94,13 @@ def _png_bytes(header: bytes) -> int:
     return total
 
 
-def _is_whole_gif(content: bytes) -> bool:
+def _is_whole_for_pillow(content: bytes) -> bool:
+    """Return whether Pillow reads all pixels of a JPEG or GIF file. Unlike OpenCV, it tells what is missing."""
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(content)) as image:
-            if image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
+            if image.format == "GIF" and image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
                 return False
             image.load()
     except Exception:  # Pillow's plugins raise errors of many classes

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.decoding import MOST_PIXELS_PER_BYTE, require_opencv_name
+from kpbench.decoding import MOST_PIXELS_PER_BYTE, is_whole_png, require_opencv_name
 from kpbench.errors import DataError, KpbenchWarning
 from kpbench.pixels import lay_on_white, png_chunk
 from kpbench.types import UInt8
@@ -156,7 +156,8 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
     head = data[:21].tobytes()
     is_gif = head[:6] in (b"GIF87a", b"GIF89a")
     is_webp = head[:4] == b"RIFF" and head[8:16] == b"WEBPVP8X" and len(head) == 21 and bool(head[20] & 2)
-    if not (is_gif or is_webp or png_chunk(data, b"acTL")):
+    is_apng = bool(png_chunk(data, b"acTL"))
+    if not (is_gif or is_webp or is_apng) or (is_apng and not is_whole_png(data.tobytes(), first_frame_alone=True)):
         return None
     from PIL import Image
 

@@ -26,6 +26,8 @@ LARGEST_NUMBER = 2**53
 """Every number of a manifest is smaller; other languages read larger ones inexactly."""
 MOST_OPEN_SHARDS = 128
 """Largest number of shards that a dataset keeps open. Many systems allow a process 256 open files."""
+FINITE_COLUMNS = ("x", "y", "radius_major", "radius_minor", "H_patch2image")
+"""Columns of a keypoint that have a finite value in every dataset."""
 
 
 @dataclass(frozen=True)
@@ -217,6 +219,7 @@ class Dataset:
             raise DataError(f"{manifest}: provenance is no object with versions and broken_backgrounds")
         if compute_fingerprint(self.config, self.shards) != self.fingerprint:
             raise DataError(f"{manifest}: its fingerprint does not fit its config and shards")
+        image_id = list[NDArray[np.int64]]()
         for shard in self.shards:
             path = self.path / shard.file
             digest = sha256_of(path)
@@ -225,13 +228,16 @@ class Dataset:
             with open_shard(path) as file, shard_errors(path):
                 count, config = len(file["images"]), file.texts["config"]
                 keypoints = file["keypoints"][:]
-            if not all(np.isfinite(keypoints[name]).all() for name in ("x", "y", "radius_major", "H_patch2image")):
+                image_id.append(file["image_id"][:])
+            if not all(np.isfinite(keypoints[name]).all() for name in FINITE_COLUMNS):
                 raise DataError(f"{path}: a keypoint has a value that is no finite number")
             if count != shard.count:
                 raise DataError(f"{manifest}: {shard.file} has count {shard.count}, expected {count}")
             if config.encode() != encode_utf8(canonical_json(self.config)):
                 raise DataError(f"{manifest}: config is not that of {shard.file}")
             yield shard
+        if len(np.unique(np.concatenate(image_id))) < len(self):
+            raise DataError(f"{manifest}: two images of its shards have the same image_id")
 
 
 def _is_provenance(content: object) -> bool:

@@ -314,10 +314,11 @@ class SuperPointDetector:
             outputs: list[Float32] = list(self._session.run(None, {"image": blob}))
         except Exception as error:  # as above
             raise DataError(f"{self.path}: the network cannot be run ({_first_line(error)})") from None
-        shape = (len(greys), -1, blob.shape[2] // CELL_PX, blob.shape[3] // CELL_PX)
-        for output, channels in zip(outputs, (CELL_PX**2 + 1, len(self.patches) + 1), strict=False):
-            if output.shape != (shape[0], channels, *shape[2:]):
-                raise DataError(f"{self.path}: an output has the shape {output.shape}, expected {channels} channels")
+        cells = (blob.shape[2] // CELL_PX, blob.shape[3] // CELL_PX)
+        expected = [(len(greys), channels, *cells) for channels in (CELL_PX**2 + 1, len(self.patches) + 1)]
+        if [np.shape(output) for output in outputs] != expected:
+            shapes = ", ".join(str(np.shape(output)) for output in outputs)
+            raise DataError(f"{self.path}: the outputs have the shapes {shapes}, expected {expected[0]}, {expected[1]}")
         return outputs
 
     def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -260,6 +261,9 @@ def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
         raise DataError("two images share an id")
     image_id = _column(annotations, "image_id", np.int64)
     keypoints, labelled = _make_keypoints(annotations)
+    for n, found in enumerate(images):
+        if found.rung is not None and not math.isfinite(found.rung):
+            raise DataError(f"images[{n}] (id {found.id}): rung is {found.rung}, expected a finite number")
     place = np.searchsorted(ids, image_id, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != image_id
     if unknown.any():
@@ -298,6 +302,7 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
             )
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
+    valid &= ~np.isinf(table["axis_angle"]) & ~np.isinf(table["visible"])
     valid &= (table["radius_major"] > 0) & (table["radius_minor"] > 0)
     valid |= ~labelled & np.isfinite(points[:, 2])
     if not valid.all():

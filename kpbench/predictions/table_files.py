@@ -96,7 +96,6 @@ def _make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
 
 def _check_columns(names: list[str], place: str) -> list[str]:
     """Check the names of a table's columns, and return the names without blanks at the ends."""
-    names = [name.strip() for name in names]
     if not {"image_id", "x", "y"} <= set(names) <= set(TABLE_COLUMNS) or len(set(names)) < len(names):
         raise PredictionsError(
             f"{place} has columns {','.join(names)[:80]}, expected {','.join(TABLE_COLUMNS)} (score, id optional)"
@@ -123,7 +122,7 @@ def read_csv(path: Path) -> Predictions:
         first, data = _cut_line(data)
         header, skipped = parse_header(parse_json(first[1:].encode(), "line 1, after #,")), 1
     first, data = _cut_line(data)
-    names = _check_columns(next(csv.reader([first]), []), f"line {1 + skipped}")
+    names = _check_columns([name.strip() for name in next(csv.reader([first]), [])], f"line {1 + skipped}")
 
     def place(row: int) -> str:
         return f"line {row + 2 + skipped}"

@@ -31,6 +31,8 @@ LEAST_IMAGE_SHARE = 0.999
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
+DEEPEST = 100
+"""Levels of a pipeline in YAML."""
 LONGEST_SCALAR = 1000
 """Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
 
@@ -78,9 +80,13 @@ def _parse_yaml(text: str) -> Any:
 
     # A few lines of aliases of aliases stand for millions of values. albumentations.save writes no alias.
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in Python needs seconds for some small files
+    depth = 0
     for event in yaml.parse(text, loader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if isinstance(event, yaml.AliasEvent) or len(getattr(event, "value", "")) > LONGEST_SCALAR:
             raise ValueError(f"it has an alias (*name), or a value of over {LONGEST_SCALAR} characters")
+        if depth > DEEPEST:
+            raise ValueError(f"it is nested more than {DEEPEST} levels deep")
     return yaml.load(text, loader)
 
 

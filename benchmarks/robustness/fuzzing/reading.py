@@ -89,9 +89,15 @@ def read_initial_weights(path: Path) -> Any:
 
 
 def read_images(path: Path) -> Any:
-    from kpbench.images import open_images
+    from kpbench.images import UNDECODABLE, open_images
 
-    return [pixels for _, pixels in open_images(str(path)).images]
+    source = open_images(str(path))
+    pixels = dict(source.images)
+    # `kpbench detect` reads on, names what cannot be read, and ends with exit code 1: that is a refusal
+    failures = [(name, source.problems.get(name, UNDECODABLE)) for name, image in pixels.items() if image is None]
+    if failures:
+        raise kpbench.KpbenchError("; ".join(source.describe_failures(failures)))
+    return list(pixels.values())
 
 
 # --- Plain parsers of containers -----------------------------------------------------------------------------------
