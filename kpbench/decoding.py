@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import struct
+import warnings
 import zlib
 from pathlib import Path
 from typing import Any
@@ -45,11 +47,11 @@ def decode_image(data: NDArray[np.uint8] | None, flags: int) -> NDArray[Any] | N
 
 
 def _is_whole(data: NDArray[np.uint8]) -> bool:
-    """Return whether the pixels of a PNG, JPEG or GIF file end within the file. OpenCV fills up what is missing."""
+    """Return whether all pixels of an image file lie within the file. OpenCV fills up what is missing."""
     content = data.tobytes()
     if content.startswith(PNG_SIGNATURE):
         return is_whole_png(content)
-    return not content.startswith((b"\xff\xd8\xff", b"GIF87a", b"GIF89a")) or _is_whole_for_pillow(content)
+    return _is_whole_for_pillow(content)
 
 
 def is_whole_png(content: bytes, first_frame_alone: bool = False) -> bool:
@@ -95,16 +97,20 @@ def _png_bytes(header: bytes) -> int:
 
 
 def _is_whole_for_pillow(content: bytes) -> bool:
-    """Return whether Pillow reads all pixels of a JPEG or GIF file. Unlike OpenCV, it tells what is missing."""
+    """Return False if Pillow finds that pixels are missing. Unlike OpenCV, Pillow tells; it knows fewer kinds of files."""
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(content)) as image:
-            if image.format == "GIF" and image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
-                return False
-            image.load()
-    except Exception:  # Pillow's plugins raise errors of many classes
-        return False
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large images, of which OpenCV decides
+            with Image.open(io.BytesIO(content)) as image:
+                if image.format == "GIF" and image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
+                    return False
+                image.load()
+    except OSError as error:
+        return not re.search("truncated|broken data stream", str(error))
+    except Exception:  # Pillow's plugins raise errors of many classes for what they do not know
+        return True
     return True
 
 
