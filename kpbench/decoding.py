@@ -97,7 +97,7 @@ def _png_bytes(header: bytes) -> int:
 
 
 def _is_whole_for_pillow(content: bytes) -> bool:
-    """Return False if Pillow finds that pixels are missing. Unlike OpenCV, Pillow tells; it knows fewer kinds of files."""
+    """Return False if Pillow finds that pixels are missing. OpenCV does not tell. Pillow knows fewer kinds of files."""
     from PIL import Image
 
     try:

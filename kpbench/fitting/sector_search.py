@@ -2,7 +2,8 @@
 
 The search uses the *core* of a design: its innermost sectors, which look the same at every size.
 
-1. :func:`search_sectors` samples circles around each place under many tilts. The largest of these is the core's circle.
+1. :func:`search_sectors` samples concentric circles around each place under many tilts. The outermost circle bounds the
+   core.
    The samples are correlated with the core of each design in each rotation.
 2. :func:`kpbench.fitting.align.align_poses` moves the poses onto the image.
 3. :func:`estimate_size` measures how far the sectors reach, which gives the size of the patch.
@@ -118,9 +119,7 @@ def estimate_size(levels: Sequence[Float32], poses: Poses, templates: DesignTemp
 
 
 def core_symmetries(poses: Poses, templates: DesignTemplates) -> tuple[Int, Poses]:
-    """Return each pose in every rotation in which the core looks the same but the whole design differs.
-
-    The given rotation is the first of these rotations.
+    """Return each pose as given, and then in every other rotation that changes the design but not its core.
 
     Returns
     -------
@@ -210,14 +209,14 @@ def _vote(levels: Sequence[Float32], poses: Poses, templates: DesignTemplates, c
 
 @lru_cache(maxsize=64)
 def _ellipse_ends(patch: Patch, count: int) -> tuple[Float, csr_array, int]:
-    """Return the shapes of ellipses that are tried, and the samples at which each ellipse ends.
+    """Return the shapes of ellipses that are tried, and for each ellipse the samples on its boundary.
 
     Returns
     -------
     shapes : ndarray of shape (G, 2, 2)
     ends : sparse array of shape (G · circles, circles · spokes)
-        A row is an ellipse of one shape and size, a column is a sample. The entry is 1 if the ellipse ends at the
-        sample.
+        A row is an ellipse of one shape and size, a column is a sample. On each spoke, the entry is 1 for the sample
+        that is nearest to the boundary of the ellipse.
     known : int
         Index of the last size at which every ellipse lies within the circles that were sampled.
     """
