@@ -93,7 +93,7 @@ class TagBoard:
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
     def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
-        """Return the outlines as :meth:`kpbench.patches.Board.outlines` does. The only ink is that of all black modules."""
+        """Return the outlines as :meth:`kpbench.patches.Board.outlines` does. The only ink is that of black modules."""
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
         ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]
