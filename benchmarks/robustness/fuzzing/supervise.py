@@ -16,6 +16,7 @@ import re
 import select
 import shutil
 import signal
+import sys
 import tempfile
 import time
 import traceback
@@ -118,10 +119,10 @@ class Worker:
             self.again.append(index)
             self.indexes = range(index + 1, self.indexes.stop)
             return [], bool(self.indexes)
-        if phase == MAKING:
-            log = (self.scratch / "noise").read_text(errors="replace")[-2000:]
-            why = f"({status}, killed {killed}, {self._frames()})\n{log}"
-            raise RuntimeError(f"{self.reader.name} {index}: the harness itself failed {why}")
+        if phase == MAKING:  # the change of the valid file takes too long: the input is left out, and does not count
+            print(f"{self.reader.name} {index}: not made ({self._frames()})", file=sys.stderr)
+            self.indexes = range(index + 1, self.indexes.stop)
+            return [], bool(self.indexes)
         self.indexes = range(index + 1, self.indexes.stop)
         if phase == CHECKING:  # a plain parser died, which says nothing of kpbench
             return [self.last] if self.last is not None else [], bool(self.indexes)
