@@ -43,7 +43,7 @@ descriptor_width = 8
 ids = 4
 
 [[phases]]
-samples = 400
+samples = 120
 """
 TIMES = re.compile(rb'"(?:seconds|command|date)": *[^,}]*')
 
@@ -66,7 +66,7 @@ def tensors(path: Path) -> object:
 
 
 JOBS = {
-    "bench": Job("bench --images 2 --size 203x155 --only blur --detector template --detector orb --workers 2", "out"),
+    "bench": Job("bench --images 1 --size 203x155 --only blur --detector orb --detector sift --workers 2", "out"),
     "train": Job("train --config tiny.toml --workers 1 --threads 1", "out", "--resume", tensors),
     "detect": Job("detect photos --detector template", "out.json"),
     "export": Job("export set --format coco", "out"),
@@ -154,9 +154,9 @@ def strike_often(names: Sequence[str], moments: int, seed: int = 0) -> dict[str,
         base = Path(name)
         inputs = base / "inputs"
         (inputs / "photos").mkdir(parents=True)
-        for n in range(40):
+        for n in range(20):
             cv2.imwrite(str(inputs / "photos" / f"{n:02d}.png"), rng.integers(0, 255, (480, 640), np.uint8))
-        generate(SynthConfig(200, size_px=(320, 240), shard_size=50), inputs / "set", workers=1)
+        generate(SynthConfig(150, size_px=(320, 240), shard_size=50), inputs / "set", workers=1)
         (inputs / "tiny.toml").write_text(RECIPE)
         tally = {}
         for name in names:
