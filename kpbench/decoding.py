@@ -23,7 +23,9 @@ from kpbench.errors import DataError
 from kpbench.files import note_read
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MOST_PIXELS_PER_BYTE = 5_000
+MOST_PIXELS_TWICE = 2**25
+"""Largest number of pixels of an image that Pillow looks at before OpenCV. Larger images would take much memory."""
+MOST_PIXELS_PER_BYTE = 2_000
 """Largest number of pixels of all frames of an animation, per byte of its file. Films have a few pixels per byte."""
 
 
@@ -104,9 +106,12 @@ def _is_whole_for_pillow(content: bytes) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images, of which OpenCV decides
             with Image.open(io.BytesIO(content)) as image:
-                if image.format == "GIF" and image.width * image.height > MOST_PIXELS_PER_BYTE * len(content):
+                pixels = image.width * image.height
+                if image.format in ("GIF", "JPEG", "JPEG2000", "WEBP") and pixels > MOST_PIXELS_PER_BYTE * len(content):
                     return False
-                image.load()
+                image.draft("RGB", (1, 1))  # a JPEG file is read whole, but made only an eighth as wide
+                if pixels <= MOST_PIXELS_TWICE or image.format == "JPEG":
+                    image.load()
     except OSError as error:
         return not re.search("truncated|broken data stream", str(error))
     except Exception:  # Pillow's plugins raise errors of many classes for what they do not know

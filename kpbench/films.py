@@ -32,6 +32,8 @@ MOST_BAD_FRAMES = 300
 """Reading ends after so many frames in a row that cannot be read."""
 FRAMES_IN_DECODER = 32
 """A decoder of several threads may report a bad frame so many frames early."""
+MOST_FRAME_PIXELS = 2**24
+"""Largest number of pixels of a frame of a GIF, an APNG or a WebP."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +126,10 @@ def _video_frames(
     """
     number, failures, start_ms = 0, 0, 0.0
     while length is None or number < length or not failures:
-        good, frame = capture.read()
+        try:
+            good, frame = capture.read()
+        except cv2.error:  # of a frame that declares too many bytes
+            good = False
         if not good:
             failures += 1
             missing = 0 if length is None else min(MOST_BAD_FRAMES, length - number)
@@ -135,7 +140,8 @@ def _video_frames(
         if not number and not failures:
             start_ms = stamp_ms
         if failures:
-            place = round((stamp_ms - start_ms) * fps / 1000) if stamp_ms > 0 else number + failures
+            is_stamped = 0 < stamp_ms < np.inf and np.isfinite(start_ms)
+            place = round((stamp_ms - start_ms) * fps / 1000) if is_stamped else number + failures
             last = number + failures + MOST_BAD_FRAMES if length is None else length - 1
             skipped = max(0, min(place, last) - number)
             yield from [None] * skipped
@@ -170,10 +176,11 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
         return None
     if length < 2:
         return None
-    if length * image.width * image.height > MOST_PIXELS_PER_BYTE * len(data):
+    pixels = image.width * image.height
+    if pixels > MOST_FRAME_PIXELS or length * pixels > MOST_PIXELS_PER_BYTE * len(data):
         raise DataError(
             f"{path}: declares {length} frames of {image.width} x {image.height} in {len(data)} bytes, "
-            f"expected at most {MOST_PIXELS_PER_BYTE} pixels per byte"
+            f"expected at most {MOST_FRAME_PIXELS} pixels, and {MOST_PIXELS_PER_BYTE} pixels of all frames per byte"
         )
     if is_gif and not data[-64:].tobytes().rstrip(b"\0").endswith(b";"):
         warnings.warn(f"{path}: is cut off after frame {length - 1}", KpbenchWarning, stacklevel=2)

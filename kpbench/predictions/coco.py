@@ -264,6 +264,8 @@ def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
     for n, found in enumerate(images):
         if found.rung is not None and not math.isfinite(found.rung):
             raise DataError(f"images[{n}] (id {found.id}): rung is {found.rung}, expected a finite number")
+        if not found.condition.isprintable():
+            raise DataError(f"images[{n}] (id {found.id}): condition is {found.condition!r}, expected a text")
     place = np.searchsorted(ids, image_id, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != image_id
     if unknown.any():
@@ -300,6 +302,10 @@ def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], ND
                 f"annotations[{n}] (image_id {annotations[n].image_id}): has no radius, "
                 "expected radius, or radius_major and radius_minor, in px"
             )
+    for name in ("axis_angle", "visible"):  # nan stands for a missing value, so the file must not hold it
+        for n in np.flatnonzero(np.isnan(table[name])).tolist():
+            if getattr(annotations[n], name) is not None:
+                raise DataError(f"annotations[{n}] (image_id {annotations[n].image_id}): {name} is no finite number")
     table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
     valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
     valid &= ~np.isinf(table["axis_angle"]) & ~np.isinf(table["visible"])

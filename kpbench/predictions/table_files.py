@@ -122,7 +122,7 @@ def read_csv(path: Path) -> Predictions:
         first, data = _cut_line(data)
         header, skipped = parse_header(parse_json(first[1:].encode(), "line 1, after #,")), 1
     first, data = _cut_line(data)
-    names = _check_columns([name.strip() for name in next(csv.reader([first]), [])], f"line {1 + skipped}")
+    names = _check_columns(_split_names(first), f"line {1 + skipped}")
 
     def place(row: int) -> str:
         return f"line {row + 2 + skipped}"
@@ -135,6 +135,13 @@ def read_csv(path: Path) -> Predictions:
     if not is_ended:
         warnings.warn(f"{path}: the last line has no line end; it may be cut off", KpbenchWarning, stacklevel=2)
     return predictions
+
+
+def _split_names(line: str) -> list[str]:
+    try:
+        return [name.strip() for name in next(csv.reader([line], strict=True), [])]
+    except csv.Error as error:
+        raise PredictionsError(f"its line of names is no CSV ({error})") from None
 
 
 def _cut_line(data: bytes) -> tuple[str, bytes]:
@@ -287,8 +294,8 @@ def read_parquet(path: Path) -> Predictions:
 
 def _unpacked_bytes(described: Any) -> int:
     """Return how many bytes the columns of a Parquet file say that they have when they are unpacked."""
-    groups = (described.row_group(n) for n in range(described.num_row_groups))
-    return sum(group.column(k).total_uncompressed_size for group in groups for k in range(group.num_columns))
+    # pyarrow ends the process over some damaged descriptions of columns, so only the sums are read
+    return sum(described.row_group(n).total_byte_size for n in range(described.num_row_groups))
 
 
 def _import_pyarrow() -> tuple[Any, Any]:
