@@ -122,7 +122,7 @@ def moment(job: Job, folder: Path, number: signal.Signals, delay_s: float, expec
     while running(run.pid) and time.monotonic() < until:
         time.sleep(0.02)
     assert not running(run.pid), "a process is left"
-    if run.returncode == 0:
+    if run.returncode == 0 or "the export is finished" in said:
         kind = "finished"
     elif not said.startswith("kpbench: interrupted"):  # before Python had loaded the command
         kind = "early"

@@ -95,12 +95,14 @@ def export(dataset: Path, file_format: str, out: Path | None) -> None:
       kpbench export val --format yolo --out val-yolo
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.dataset.export import export_dataset
+    from kpbench.dataset.export import UNFINISHED, export_dataset
     from kpbench.dataset.folder import open_dataset
 
-    data = open_dataset(dataset)
+    data, target = open_dataset(dataset), out or Path(f"{dataset}-{file_format}")
     try:
         with progress_bar(len(data), "export") as progress:
-            echo(export_dataset(data, file_format, out or Path(f"{dataset}-{file_format}"), progress))
+            echo(export_dataset(data, file_format, target, progress))
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("the same command continues the export") from None
+        is_finished = target.exists() and not (target / UNFINISHED).exists()
+        message = "the export is finished" if is_finished else "the same command continues the export"
+        raise KeyboardInterrupt(message) from None
