@@ -103,6 +103,6 @@ def export(dataset: Path, file_format: str, out: Path | None) -> None:
         with progress_bar(len(data), "export") as progress:
             echo(export_dataset(data, file_format, target, progress))
     except KeyboardInterrupt:
-        is_finished = target.exists() and not (target / UNFINISHED).exists()
+        is_finished = (target / "README.md").exists() and not (target / UNFINISHED).exists()
         message = "the export is finished" if is_finished else "the same command continues the export"
         raise KeyboardInterrupt(message) from None
