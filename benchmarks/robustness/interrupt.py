@@ -36,8 +36,11 @@ SIGNALS = {"interrupt": signal.SIGINT, "terminate": signal.SIGTERM, "hangup": si
 
 
 def start(out: Path, *more: str) -> subprocess.Popen[str]:
-    # a shell's background jobs ignore Ctrl-C; the command must not inherit that
-    code = "import signal, kpbench.cli; signal.signal(signal.SIGINT, signal.default_int_handler); kpbench.cli.main()"
+    # a shell's background jobs ignore Ctrl-C, and those of nohup SIGHUP; the command must not inherit that
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL); import kpbench.cli; kpbench.cli.main()"
+    )
     words = [sys.executable, "-c", code, *WORDS, "--out", str(out), *more]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
 

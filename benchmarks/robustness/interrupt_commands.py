@@ -74,8 +74,11 @@ JOBS = {
 
 
 def start(job: Job, folder: Path, more: str = "") -> subprocess.Popen[str]:
-    # a shell's background jobs ignore Ctrl-C; the command must not inherit that
-    code = "import signal, kpbench.cli; signal.signal(signal.SIGINT, signal.default_int_handler); kpbench.cli.main()"
+    # a shell's background jobs ignore Ctrl-C, and those of nohup SIGHUP; the command must not inherit that
+    code = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL); import kpbench.cli; kpbench.cli.main()"
+    )
     words = [sys.executable, "-c", code, *job.words.split(), "--out", job.out, *more.split()]
     return subprocess.Popen(words, cwd=folder, stderr=subprocess.PIPE, text=True, stdout=-3, start_new_session=True)
 
@@ -144,7 +147,8 @@ def moment(job: Job, folder: Path, number: signal.Signals, delay_s: float, expec
         name = f"{job.out}/checkpoint.safetensors"
         assert after[name] == expected[name], "the resumed training differs"
     else:
-        assert after == expected, "the resumed run differs"
+        differing = sorted(k for k in after.keys() | expected.keys() if after.get(k) != expected.get(k))
+        assert after == expected, f"the resumed run differs in {differing[:3]}"
     return kind
 
 
