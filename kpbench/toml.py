@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 import tomllib
 from collections.abc import Collection, Iterator, Mapping
@@ -17,6 +18,9 @@ from kpbench.text import NAME_RULE, is_name
 
 LARGEST = sys.float_info.max
 """Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
+DEEPEST_KEY = 50
+"""Largest number of parts of a dotted key, such as ``a.b.c``."""
+DEEP_KEY = re.compile(rf"""(?:[\w"'-]+[ \t]*\.[ \t]*){{{DEEPEST_KEY}}}""")
 MOST_ENTRIES = 10_000
 """Largest number of entries of a list of tables."""
 
@@ -30,6 +34,8 @@ def read_toml(path: str | Path, error: type[KpbenchError]) -> dict[str, Any]:
         If the file cannot be read or is no TOML. The message names the file.
     """
     text = read_text(path, error)
+    if DEEP_KEY.search(text):  # tomllib takes gigabytes for a key of a hundred thousand parts
+        raise error(f"{path}: not valid TOML (it has a key of over {DEEPEST_KEY} parts)")
     try:
         return tomllib.loads(text)
     except ValueError as problem:  # TOMLDecodeError, or a number of thousands of digits

@@ -165,12 +165,26 @@ def remove_file(path: Path, kind: str) -> None:
     DataError
         If kpbench did not write the file, or wrote it as a file of another kind.
     """
+    require_removable(path, kind)
     try:
-        if is_local(path) and path.exists() and path.stat().st_size and kind_of(*_ends(path)) != kind:
-            raise DataError(f"{path}: would be removed, but kpbench did not write it; move it elsewhere")
         path.unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f"{path}: cannot be removed, {system_reason(error) or error}") from None
+
+
+def require_removable(path: Path, kind: str) -> None:
+    """Refuse a file that :func:`remove_file` would refuse.
+
+    Raises
+    ------
+    DataError
+        As :func:`remove_file`.
+    """
+    try:
+        if is_local(path) and path.exists() and path.stat().st_size and kind_of(*_ends(path)) != kind:
+            raise DataError(f"{path}: would be removed, but kpbench did not write it; move it elsewhere")
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
 
 
 def remove_leftovers(paths: Iterable[Path]) -> None:

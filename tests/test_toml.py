@@ -3,7 +3,7 @@ import re
 import pytest
 
 from kpbench.errors import DataError
-from kpbench.toml import TomlTable, name_source
+from kpbench.toml import TomlTable, name_source, read_toml
 
 
 @pytest.mark.parametrize(
@@ -39,3 +39,9 @@ def test_values_are_numbers_of_the_kind_that_was_asked_for():
     assert table.span("b", 0, 9) == (3.0, 3.0)
     assert table.number("d", 0, 9, 7.0) == 7.0
     assert "d" not in table
+
+
+def test_a_key_of_many_parts_is_refused_before_it_takes_all_memory(tmp_path):
+    (tmp_path / "a.toml").write_text("a." * 100_000 + "b = 1")
+    with pytest.raises(DataError, match="a key of over 50 parts"):
+        read_toml(tmp_path / "a.toml", DataError)

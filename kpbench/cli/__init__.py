@@ -116,4 +116,7 @@ def run() -> None:
     from kpbench.cli.process import open_standard_streams
 
     open_standard_streams()
-    main(prog_name="kpbench")
+    try:
+        main(prog_name="kpbench")
+    except OSError:  # of standard output, outside of the commands: for `kpbench --help >/dev/full`
+        os._exit(1)

@@ -14,7 +14,7 @@ from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
 from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
 from kpbench.files import load_json, sha256_of
-from kpbench.writing import is_replaceable, remove_file, remove_leftovers
+from kpbench.writing import is_replaceable, remove_file, remove_leftovers, require_removable
 
 MOST_SHARDS = 4_000_000
 """Largest number of shards of a dataset."""
@@ -93,6 +93,8 @@ def prepare_folder(
     is_whole = len(plan) == len(plan_shards(config["n"], config["shard_size"]))
     concerned = present if is_whole else planned
     if overwrite:
+        for path in [manifest, *concerned]:  # all of them are looked at before the first is removed
+            require_removable(path, "dataset")
         for path in [manifest, *concerned]:
             remove_file(path, "dataset")
         for name, kind in zip(CARD_FILES, ("card", "picture"), strict=True):

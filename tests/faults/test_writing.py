@@ -116,6 +116,8 @@ def test_overwrite_and_resume_leave_what_the_user_put_into_a_dataset(tmp_path):
     with pytest.raises(DataError, match=r"shard-00000\.h5: would be removed, but kpbench did not write it"):
         generate(config, folder, workers=1, overwrite=True)
     assert (folder / "shard-00000.h5").read_bytes() == b"mine"
+    assert (folder / "shard-00001.h5").exists()
+    assert (folder / "dataset.json").exists()
 
 
 def test_a_lock_that_is_a_link_truncates_nothing(tmp_path):
