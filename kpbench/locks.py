@@ -57,5 +57,5 @@ def lock_folder(folder: Path, shared: bool = False) -> Iterator[None]:
         try:
             yield
         finally:
-            if not shared:
+            if not shared and not os.fstat(file.fileno()).st_size:  # a file with content is the user's
                 path.unlink(missing_ok=True)

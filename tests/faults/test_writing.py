@@ -239,3 +239,10 @@ def test_every_file_of_every_command_tells_its_kind(made):
     shutil.rmtree(made / "set")
     with pytest.raises(DataError):
         open_dataset(made / "set")
+
+
+def test_a_lock_with_content_is_the_users(tmp_path):
+    (tmp_path / "set").mkdir()
+    (tmp_path / "set" / ".kpbench.lock").write_text("of the user")
+    generate(SynthConfig(1, size_px=(64, 64)), tmp_path / "set", workers=1)
+    assert (tmp_path / "set" / ".kpbench.lock").read_text() == "of the user"
