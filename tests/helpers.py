@@ -5,7 +5,7 @@ import numpy as np
 from click.testing import CliRunner
 
 from kpbench.cli import main
-from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.folder import ShardEntry, make_manifest, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.files import sha256_of
 from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions
@@ -54,7 +54,8 @@ def write_dataset(folder, images, condition="", seed=0):
     config = {"seed": seed}
     path = folder / "shard-00000.h5"
     write_file(path, encode_shard(samples, len(samples), config))
-    write_manifest(folder, config, [ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))], {})
+    entry = ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))
+    write_manifest(folder, make_manifest(config, [entry], {}))
     return open_dataset(folder)
 
 

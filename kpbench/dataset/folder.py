@@ -65,23 +65,25 @@ def compute_fingerprint(config: Mapping[str, Any], shards: Sequence[ShardEntry])
     return hashlib.sha256(encode_utf8("\n".join(lines))).hexdigest()
 
 
-def write_manifest(
-    folder: Path, config: Mapping[str, Any], shards: Sequence[ShardEntry], provenance: Mapping[str, Any]
-) -> str:
-    """Write ``dataset.json``, which makes the folder a finished dataset; return the dataset's fingerprint."""
-    fingerprint = compute_fingerprint(config, shards)
-    content = {
+def make_manifest(
+    config: Mapping[str, Any], shards: Sequence[ShardEntry], provenance: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Return the content of ``dataset.json``."""
+    return {
         "schema": DATASET_SCHEMA,
         "version": 1,
-        "fingerprint": fingerprint,
+        "fingerprint": compute_fingerprint(config, shards),
         "seed": config.get("seed"),
         "images": sum(shard.count for shard in shards),
         "config": json.loads(canonical_json(config)),  # sorts the keys
         "shards": [vars(shard) for shard in shards],
         "provenance": dict(provenance),
     }
+
+
+def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
+    """Write ``dataset.json``, which makes the folder a finished dataset."""
     write_file(folder / MANIFEST, encode_utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
-    return fingerprint
 
 
 def recorded_digests(folder: Path) -> dict[str, str]:

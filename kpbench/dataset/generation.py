@@ -22,7 +22,7 @@ from typing import Any
 
 from kpbench.dataset.card import write_card
 from kpbench.dataset.config import DatasetConfig
-from kpbench.dataset.folder import Dataset, ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.folder import Dataset, ShardEntry, make_manifest, open_dataset, write_manifest
 from kpbench.dataset.resume import (
     FinishedShard,
     PlannedShard,
@@ -307,7 +307,7 @@ def _make_missing_shards(run: _Run, kept: dict[str, FinishedShard]) -> dict[str,
 def _finish_dataset(
     folder: Path, written: dict[str, Any], shards: list[FinishedShard]
 ) -> tuple[Dataset, tuple[str, ...]]:
-    """Write the manifest, which makes the folder a dataset, and the dataset's card.
+    """Write the dataset's card, and last the manifest, which makes the folder a finished dataset.
 
     Returns
     -------
@@ -317,10 +317,10 @@ def _finish_dataset(
     """
     broken_files = tuple(sorted({file for shard in shards for file in shard.broken_files}))
     with name_folder_in_errors(folder):
-        write_manifest(folder, written, [shard.entry for shard in shards], _provenance(broken_files))
-        dataset = open_dataset(folder)
-        write_card(dataset, folder)
-    return dataset, broken_files
+        manifest = make_manifest(written, [shard.entry for shard in shards], _provenance(broken_files))
+        write_card(Dataset(folder, manifest), folder)
+        write_manifest(folder, manifest)
+        return open_dataset(folder), broken_files
 
 
 def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from kpbench.dataset import folder
-from kpbench.dataset.folder import ShardEntry, open_dataset, write_manifest
+from kpbench.dataset.folder import ShardEntry, make_manifest, open_dataset, write_manifest
 from kpbench.dataset.shard import Sample, encode_shard, open_shard
 from kpbench.errors import DataError
 from kpbench.files import sha256_of
@@ -38,7 +38,7 @@ def write_dataset(folder, counts=(4, 3), shape=(40, 50)):
         write_file(path, data)
         entries.append(ShardEntry(path.name, first, count, len(data), sha256_of(path)))
         first += count
-    write_manifest(folder, CONFIG, entries, {})
+    write_manifest(folder, make_manifest(CONFIG, entries, {}))
     return folder
 
 

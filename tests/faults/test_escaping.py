@@ -18,7 +18,7 @@ from helpers import perfect_predictions, write_dataset
 from kpbench import cli, open_dataset, read_predictions, score, write_predictions
 from kpbench.cli.messages import clean_usage_error, echo
 from kpbench.dataset.card import write_card
-from kpbench.dataset.folder import write_manifest
+from kpbench.dataset.folder import make_manifest, write_manifest
 from kpbench.errors import KpbenchWarning
 from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report
 from kpbench.report.result_files import encode_scores_csv
@@ -171,7 +171,7 @@ def test_a_dataset_card_is_text(tmp_path):
     for text in EVIL.values():
         patches = [{"id": 0, "name": text}]
         config = {"seed": text, "patches": patches, "deteriorate": text, "backgrounds": {"kind": text}}
-        write_manifest(tmp_path / "set", config, data.shards, {"versions": {text: text}})
+        write_manifest(tmp_path / "set", make_manifest(config, data.shards, {"versions": {text: text}}))
         write_card(open_dataset(tmp_path / "set"), tmp_path / "set")
         card = (tmp_path / "set" / "README.md").read_text("utf-8").partition("-->")[2]
         assert not re.search(r"(?<![\\])<|(?<!\\)!\[p", card)
@@ -235,7 +235,7 @@ def test_no_command_prints_control_characters(here):
     write_dataset(here / "set", IMAGES, condition="a\x1b[31m")
     data = open_dataset(here / "set")
     config = {"patches": [{"id": 0, "name": evil}], "seed": evil, "deteriorate": evil}
-    write_manifest(here / "set", config, data.shards, {})
+    write_manifest(here / "set", make_manifest(config, data.shards, {}))
     about = {"detector": {"name": evil, "version": evil, "failures": [[0, evil]]}, "image_id": [0, 1]}
     file = f"a{evil}.json".replace("/", "-")
     write_predictions(file, perfect_predictions(IMAGES, dataset=evil, **about))
