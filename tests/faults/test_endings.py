@@ -39,7 +39,13 @@ def running(group):
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_a_run_as_ctrl_c_does(here, number, code):
     words = ["synth", "--n", "4000", "--size", "320x240", "--shard-size", "10", "--workers", "2", "--out", "set"]
-    with subprocess.Popen([*COMMAND, *words], stderr=subprocess.PIPE, text=True, start_new_session=True) as run:
+    options = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    inherited = signal.signal(number, signal.SIG_DFL)  # SIGHUP is ignored under nohup
+    try:
+        started = subprocess.Popen([*COMMAND, *words], **options)
+    finally:
+        signal.signal(number, inherited)
+    with started as run:
         until = time.monotonic() + 30
         while not list(here.glob("set/shard-*")) and time.monotonic() < until:
             time.sleep(0.05)
