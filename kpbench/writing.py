@@ -2,7 +2,7 @@
 
 1. A file appears whole or not at all.
 2. A file that exists is replaced only if it is empty, or if kpbench wrote it as a file of the same kind. A mark in each
-   file names the kind: a text such as ``kpbench.predictions/1``.
+   file names the kind: a text such as ``kpbench.predictions/1``, in the place that the form of the file has for it.
 3. A command never writes to a file that it reads.
 4. A symbolic link is followed. Data for a device or a pipe go into the device or pipe, which is not replaced.
 5. A new file gets its mode from the umask. A replaced file keeps its mode.
@@ -23,20 +23,56 @@ from pathlib import Path
 from kpbench.errors import DataError, system_reason
 from kpbench.files import is_local, is_read
 
-MARK = re.compile(rb"kpbench\.([a-z-]+)/\d")
-USER_KINDS = ("board-design", "patch", "suite")
-"""Kinds of files that users write and kpbench only reads."""
+_MARK = rb"kpbench\.(?P<kind>[a-z-]+)/\d+"
+_TEXT_MARKS = [
+    re.compile(pattern.replace(b"MARK", _MARK), re.DOTALL)
+    for pattern in (
+        rb'\s*\{\s*"schema"\s*:\s*"MARK"',  # JSON, and JSON Lines
+        rb'\{"info": \{"description": "kpbench dataset \(MARK\)"',  # COCO
+        rb'# \{"schema": "MARK"',  # CSV of predictions
+        rb"schema,[^\n]*\nMARK,",  # CSV of scores
+        rb'<!doctype html>\n(?:<[^\n]*\n){1,9}?<meta name="generator" content="MARK">\n',
+        rb"<\?xml [^\n]*\n<svg [^\n]*\n<!-- MARK -->\n",  # SVG
+        rb"<!-- MARK -->\n",  # Markdown of a report
+        rb"---\n(?:[^\n]+\n){1,9}---\n\n<!-- MARK: kpbench replaces this file ",  # Markdown of a dataset's card
+        rb"% MARK\n",  # LaTeX
+        rb"# MARK\ntrain: images\n",  # YAML of an export
+        rb"999\nMARK\n",  # DXF
+        rb"MARK (?:coco|yolo|webdataset) [0-9a-f]{64}\n",  # state of an export
+    )
+]
+"""The start of each form of text that kpbench writes. In a text of any other form, a mark is a quotation."""
+_BINARY_MARKS = [
+    (re.compile(start, re.DOTALL), re.compile(pattern.replace(b"MARK", _MARK), re.DOTALL))
+    for start, pattern in (
+        (rb"\x89PNG\r\n\x1a\n", rb"tEXtSoftware\0MARK"),
+        (rb"\xff\xd8\xff\xfe\0.", rb"\A....\0.MARK"),  # JPEG whose first segment is a comment
+        (rb"%PDF-", rb"/Keywords \(MARK\)"),
+        (rb"....ftyp|RIFF|\x1aE\xdf\xa3", rb"MARK \Z"),  # films
+        (rb"PAR1", rb'\{"schema": "MARK"'),  # Parquet
+        (rb'.{8}\{"__metadata__":', rb'\{\\"schema\\": \\"MARK\\"'),  # safetensors
+        # the last two forms also hold designs, each with the mark of a design
+        (rb"\x89HDF\r\n\x1a\n", rb"kpbench\.(?P<kind>dataset|predictions)/\d+"),
+        (rb"\x08[\x01-\x20]", rb'"schema": "kpbench\.(?P<kind>superpoint|verifier)/\d+"'),  # ONNX
+    )
+]
+"""The start of each binary form that kpbench writes, and how a mark stands in the form."""
 HEAD_BYTES, TAIL_BYTES = 65536, 16384
-"""A mark lies in the first ``HEAD_BYTES`` bytes or in the last ``TAIL_BYTES`` bytes of a file."""
+"""The mark of a binary form lies in the first ``HEAD_BYTES`` bytes or in the last ``TAIL_BYTES`` bytes of a file."""
 
 
 def kind_of(head: bytes, tail: bytes = b"") -> str | None:
-    """Return the kind that the first mark of a file names; None if kpbench did not write the file."""
-    for part in (head, tail):
-        for found in MARK.finditer(part):
-            if (kind := found[1].decode()) not in USER_KINDS:
-                return kind
-    return None
+    """Return the kind that the mark of a file names; None if kpbench did not write the file.
+
+    A mark counts only in the place where kpbench's own writer of the form puts it.
+    """
+    text = head.replace(b"\r\n", b"\n")  # git may have changed the ends of lines
+    found = next(filter(None, (pattern.match(text) for pattern in _TEXT_MARKS)), None)
+    for start, pattern in () if found else _BINARY_MARKS:
+        if start.match(head):
+            found = pattern.search(head) or pattern.search(tail)
+            break
+    return found["kind"].decode() if found else None
 
 
 def write_file(path: Path, data: bytes | memoryview) -> None:

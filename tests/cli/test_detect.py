@@ -195,13 +195,13 @@ def test_predictions_for_another_dataset_are_refused_by_its_fingerprint(folder, 
 )
 def test_mistakes_in_a_detector_of_ones_own_are_one_line_and_keep_older_predictions(folder, code, says):
     photos(folder)
-    (folder / "preds.json").write_text("kpbench.predictions/1, earlier")
+    (folder / "preds.json").write_text('{"schema": "kpbench.predictions/1"}')
     name = f"bad_{abs(hash((str(folder), code)))}"
     (folder / f"{name}.py").write_text(code)
     result = kpbench("detect", "photos", "--detector", f"{name}:f", code=1)
     assert says in result.stderr
     assert result.stderr.count("\n") == 1
-    assert (folder / "preds.json").read_text() == "kpbench.predictions/1, earlier"
+    assert (folder / "preds.json").read_text() == '{"schema": "kpbench.predictions/1"}'
 
 
 def test_template_looks_for_the_designs_it_is_told(folder):

@@ -183,11 +183,11 @@ def test_nothing_is_kept_in_the_heap_of_variable_length_data(whole):
 
 def test_an_atomic_write_leaves_the_old_file_or_the_new_one(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    write_file(path, b"kpbench.picture/1 old")
+    write_file(path, b"% kpbench.report/1\n old")
     monkeypatch.setattr(os, "fsync", lambda fd: (_ for _ in ()).throw(OSError(28, "No space left on device")))
     with pytest.raises(DataError, match="the disk is full"):
-        write_file(path, b"kpbench.picture/1 new")
-    assert path.read_bytes() == b"kpbench.picture/1 old"
+        write_file(path, b"% kpbench.report/1\n new")
+    assert path.read_bytes() == b"% kpbench.report/1\n old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 

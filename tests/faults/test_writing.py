@@ -17,7 +17,7 @@ from kpbench.synth.synthetic import SynthConfig
 from kpbench.writing import kind_of, move_file, remove_file, require_writable, write_file
 
 IMAGES = [[(3, 4, 2, 0), (6, 2, 2, 1)], [(5, 5, 2, 2)]]
-OURS, OTHER = b"... kpbench.scores/1 ...", b"... kpbench.report/1 ..."
+OURS, OTHER = b'{"schema": "kpbench.scores/1"}', b"<!-- kpbench.report/1 -->\n"
 
 
 @pytest.fixture
