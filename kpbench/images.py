@@ -6,10 +6,11 @@ Images are uint8, grey (H, W) or RGB (H, W, 3).
 from __future__ import annotations
 
 import errno
+import os
 import secrets
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -30,12 +31,9 @@ UNDECODABLE = "cannot be decoded"
 """Message about an image without pixels."""
 PNG_HEAD_BYTES = 33
 """Length of the signature and of the first chunk (IHDR) of a PNG file."""
-_SOFTWARE = b"tEXtSoftware\0kpbench.picture/1"
-PNG_MARK = struct.pack(">I", len(_SOFTWARE) - 4) + _SOFTWARE + struct.pack(">I", zlib.crc32(_SOFTWARE))
-"""PNG chunk that marks a file as written by kpbench. :func:`kpbench.writing.write_file` may replace such a file."""
-JPEG_MARK = b"\xff\xfe\0\x13kpbench.picture/1"
-"""JPEG comment that marks a file in the same way."""
 VIDEO_MARK = b"kpbench.video/1 "
+OVERLAY = "overlay"
+"""Kind of the images into which detections are drawn."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +53,8 @@ class ImageSource:
     problems : dict of str to str
         Why an image has no pixels, by name, filled while ``images`` is read. A name that is not here could not be
         decoded.
+    names : tuple of str or None
+        The names of all images; None if they are the numbers of frames, such as ``00000012.png``.
     """
 
     images: Iterator[tuple[str, UInt8 | None]]
@@ -62,6 +62,7 @@ class ImageSource:
     fps: float | None = None
     film: str = ""
     problems: dict[str, str] = field(default_factory=dict)
+    names: tuple[str, ...] | None = None
 
     def describe_failures(self, failures: Sequence[tuple[str, str]]) -> list[str]:
         """Return failures, each a name and a message, in lines; one line for all frames with the same message."""
@@ -99,7 +100,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
         problems: dict[str, str] = {}
-        return ImageSource(_read_folder(path, files, problems), len(files), problems=problems)
+        return ImageSource(_read_folder(path, files, problems), len(files), problems=problems, names=files)
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -110,7 +111,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         return _source_of(image, source)
     if isinstance(image, str):
         raise DataError(f"{path}: {image}{' as an image of at most 200 megapixels' if image == UNDECODABLE else ''}")
-    return ImageSource(iter([(path.name, image)]), 1)
+    return ImageSource(iter([(path.name, image)]), 1, names=(path.name,))
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:
@@ -163,7 +164,7 @@ def _source_of(film: Film, name: str) -> ImageSource:
 
 @contextmanager
 def image_writer(
-    target: Path | None, count: int | None, fps: float | None = None
+    target: Path | None, count: int | None, fps: float | None = None, names: Iterable[str] | None = None
 ) -> Iterator[Callable[[str, UInt8 | None], None]]:
     """Yield a function that writes RGB images under their names.
 
@@ -177,11 +178,14 @@ def image_writer(
         Number of images; None if unknown.
     fps : float or None
         Frames per second of a video.
+    names : iterable of str or None
+        The names of all images, see :class:`ImageSource`.
 
     Raises
     ------
     DataError
-        If the target cannot be written, or is one image file while ``count`` is not 1.
+        If the target cannot be written, or is one image file while ``count`` is not 1. Files that must not be replaced
+        are refused before the first image.
     """
     if target is None:
         yield lambda name, image: None
@@ -196,15 +200,55 @@ def image_writer(
             yield write_frame
         return
 
+    if to_file:
+        require_writable(target, OVERLAY)
+    else:
+        require_drawable(target, names, OVERLAY)
+
     def write_drawing(name: str, image: UInt8 | None) -> None:
         if image is None:
             return
-        path = target if to_file else target / (name if name.endswith(".png") else f"{name}.png")
+        path = target if to_file else target / drawing_name(name)
         make_folder(path.parent)
         # cv2.imwrite leaves half a file on a full disk, and ends the process if a name is not UTF-8
-        write_file(path, _encode(image, path.suffix.lower(), []))
+        write_file(path, _encode(image, path.suffix.lower(), [], OVERLAY))
 
     yield write_drawing
+
+
+def drawing_name(name: str) -> str:
+    """Return the name of the PNG file that is made from an image. Different images have different names.
+
+    Examples
+    --------
+    >>> from kpbench.images import drawing_name
+    >>> [drawing_name(name) for name in ("a.png", "a.jpg", "a.jpg.png")]
+    ['a.png', 'a.jpg.png', 'a.jpg.png.png']
+    """
+    is_png_alone = name.endswith(".png") and Path(name[:-4]).suffix.lower() not in IMAGE_SUFFIXES
+    return name if is_png_alone else f"{name}.png"
+
+
+def require_drawable(folder: Path, names: Iterable[str] | None, kind: str) -> None:
+    """Refuse, before any work is done, a folder in which the PNG files of images would replace other files.
+
+    Parameters
+    ----------
+    folder : Path
+    names : iterable of str or None
+        The names of all images, see :class:`ImageSource`. With None, all PNG files that are named like frames count.
+    kind : str
+        The kind of the PNG files, see :mod:`kpbench.writing`.
+
+    Raises
+    ------
+    DataError
+        The message names a file that must not be replaced.
+    """
+    targets = folder.glob(f"{'[0-9]' * 8}.png") if names is None else (folder / drawing_name(name) for name in names)
+    for target in targets:
+        if os.path.lexists(target):
+            require_writable(target, kind)
 
 
 @contextmanager
@@ -305,19 +349,27 @@ def decode_photo(path: Path, channels: int) -> UInt8 | None:
     return None if image is None or min(image.shape[:2]) < 8 else image
 
 
-def encode_png(image: UInt8) -> bytes:
-    """Return a grey or RGB image as the content of a PNG file."""
-    return _encode(image, ".png", [])
+def encode_png(image: UInt8, kind: str) -> bytes:
+    """Return a grey or RGB image as the content of a PNG file, whose mark names a kind of file.
+
+    Each command gives its own kind to its images, because only a file of the same kind is replaced:
+    see :mod:`kpbench.writing`.
+    """
+    return _encode(image, ".png", [], kind)
 
 
 def encode_jpeg(image: UInt8, quality: int) -> bytes:
     """Return a grey or RGB image as the content of a JPEG file; ``quality`` is from 1 to 100."""
-    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return _encode(image, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, quality], "picture")
 
 
-def _encode(image: UInt8, suffix: str, settings: list[int]) -> bytes:
+def _encode(image: UInt8, suffix: str, settings: list[int], kind: str) -> bytes:
+    """Return an image file with a mark: PNG has a text chunk, JPEG a comment."""
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     data = cv2.imencode(suffix, pixels, settings)[1].tobytes()
+    mark = f"kpbench.{kind}/1".encode()
     if suffix == ".png":
-        return data[:PNG_HEAD_BYTES] + PNG_MARK + data[PNG_HEAD_BYTES:]
-    return data[:2] + JPEG_MARK + data[2:]
+        chunk = b"tEXtSoftware\0" + mark
+        chunk = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        return data[:PNG_HEAD_BYTES] + chunk + data[PNG_HEAD_BYTES:]
+    return data[:2] + b"\xff\xfe" + struct.pack(">H", len(mark) + 2) + mark + data[2:]

@@ -97,7 +97,7 @@ def analyse_patches(
     suffix = Path(figure_file or "a.svg").suffix.lower()
     if suffix not in FIGURE_SUFFIXES:
         raise DesignError(f"{figure_file}: expected a file that ends in {', '.join(FIGURE_SUFFIXES)}")
-    for file, kind in ((json_file, "analysis"), (figure_file, "print")):
+    for file, kind in ((json_file, "analysis"), (figure_file, "figure")):
         if file is not None:
             require_writable(Path(file), kind)
     windows = background_windows(backgrounds)

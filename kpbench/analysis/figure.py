@@ -56,7 +56,9 @@ def draw_designs(analysis: Analysis, patches: Sequence[Patch]) -> Page:
                 width = BAR * float(np.clip(value / full, 0.005, 1.0))
                 shapes.append(Shape(rectangle(x, y + 0.6, width, 1.2)))
                 texts.append(Text(f"{label}: {value:.3g}", x, y, FONT))
-    return Page(PAGE_WIDTH, TOP + len(patches) * ROW, tuple(shapes), tuple(texts), "kpbench design analysis")
+    return Page(
+        PAGE_WIDTH, TOP + len(patches) * ROW, tuple(shapes), tuple(texts), "kpbench design analysis", "kpbench.figure/1"
+    )
 
 
 def _summary(design: DesignMeasures) -> str:

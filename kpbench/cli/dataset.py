@@ -76,7 +76,7 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     data = open_dataset(dataset)
     target = out or data.path / "preview.png"
     require_writable(target, "picture")
-    write_file(target, encode_png(draw_overview(data, count, columns, tile_width)))
+    write_file(target, encode_png(draw_overview(data, count, columns, tile_width), "picture"))
     echo(target)
 
 

@@ -179,7 +179,9 @@ def write_card(dataset: Dataset, folder: Path) -> None:
     """
     card, picture = CARD_FILES
     if is_replaceable(folder / picture, "picture"):
-        write_file(folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320)))
+        write_file(
+            folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320), "picture")
+        )
     if not is_replaceable(folder / card, "card"):
         return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))

@@ -29,6 +29,8 @@ from kpbench.writing import remove_file, require_space, write_file
 
 EXPORT_MARK = "kpbench.export/1"
 """Mark in the main file of an export to COCO or YOLO."""
+IMAGE_KIND = "exported-image"
+"""Kind of the exported images."""
 UNFINISHED = ".kpbench-unfinished"
 """File that stands in the folder of an export until the export is finished. The same export then continues."""
 
@@ -107,7 +109,7 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     for n in range(len(dataset)):
         image, keypoints = dataset[n]
         name = f"{ids[n]:08d}.png"
-        write_file(folder / "images" / name, encode_png(image))
+        write_file(folder / "images" / name, encode_png(image, IMAGE_KIND))
         height, width = image.shape[:2]
         groups = _scoring_groups(dataset, n)
         images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height, **groups})
@@ -160,7 +162,7 @@ def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
             numbers = [(x + w / 2) / width, (y + h / 2) / height, w / width, h / height]
             numbers += [(k["x"] + 0.5) / width, (k["y"] + 0.5) / height]
             lines.append(f"{classes[int(k['patch_id'])]} {' '.join(f'{v:.9f}' for v in numbers)} 2\n")
-        write_file(folder / "images" / f"{ids[n]:08d}.png", encode_png(image))
+        write_file(folder / "images" / f"{ids[n]:08d}.png", encode_png(image, IMAGE_KIND))
         write_file(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
     listing = "".join(f"  {classes[patch_id]}: {json.dumps(name)}\n" for patch_id, name in names.items())
@@ -180,7 +182,10 @@ def _export_webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Pa
                 image, keypoints = dataset[n]
                 columns = {name: _to_json_numbers(keypoints[name]) for name in KEYPOINT_DTYPE.names or ()}
                 label = {"image_id": int(ids[n]), "keypoints": columns, "degradations": dataset.effects(n)}
-                for suffix, data in (("png", encode_png(image)), ("json", json.dumps(label, allow_nan=False).encode())):
+                for suffix, data in (
+                    ("png", encode_png(image, IMAGE_KIND)),
+                    ("json", json.dumps(label, allow_nan=False).encode()),
+                ):
                     entry = tarfile.TarInfo(f"{ids[n]:08d}.{suffix}")
                     entry.size = len(data)
                     tar.addfile(entry, io.BytesIO(data))

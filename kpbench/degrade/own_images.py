@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -9,12 +10,25 @@ import numpy as np
 
 from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import apply_effects, draw_effect
-from kpbench.errors import DataError
+from kpbench.errors import DataError, KpbenchWarning
 from kpbench.files import make_folder
-from kpbench.images import UNDECODABLE, ImageSource, encode_png, open_images, refuse_same_folder
+from kpbench.images import (
+    UNDECODABLE,
+    ImageSource,
+    drawing_name,
+    encode_png,
+    open_images,
+    refuse_same_folder,
+    require_drawable,
+)
 from kpbench.seeds import stream
 from kpbench.types import UInt8
 from kpbench.writing import write_file
+
+DEGRADED = "degraded"
+"""Kind of the degraded images."""
+MOST_WARNINGS = 5
+"""Largest number of images that cannot be read and are warned of one by one."""
 
 
 def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
@@ -30,7 +44,8 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
     Raises
     ------
     DataError
-        If the source cannot be opened or is a dataset, or ``out`` is the folder of the images.
+        If the source cannot be opened or is a dataset, ``out`` is the folder of the images, or ``out`` holds a file
+        that must not be replaced.
 
     Examples
     --------
@@ -44,7 +59,9 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
     if (Path(source) / "dataset.json").exists():
         raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
     refuse_same_folder(source, Path(out))
-    return open_images(str(source), exclude=Path(out))
+    images = open_images(str(source), exclude=Path(out))
+    require_drawable(Path(out), images.names, DEGRADED)
+    return images
 
 
 def degrade_files(
@@ -75,7 +92,7 @@ def degrade_files(
     ------
     DataError
         If an effect is unknown, a level is out of bounds, or a file cannot be written. If an image cannot be read,
-        the error is raised after all other images are written.
+        a warning names the image, and the error is raised after all other images are written.
 
     Examples
     --------
@@ -96,13 +113,14 @@ def degrade_files(
         rng = stream(seed, n, 0)
         effects = [draw_effect(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
         image = apply_effects(image, rng, effects)
-        target = Path(out, name if name.endswith(".png") else f"{name}.png")
+        target = Path(out, drawing_name(name))
         make_folder(target.parent)
-        write_file(target, encode_png(image))
+        write_file(target, encode_png(image, DEGRADED))
         yield target, effects
     if broken:
-        lines = source.describe_failures(broken)
-        raise DataError(f"{len(broken)} images cannot be read, the others are done: {'; '.join(lines[:5])}")
+        for line in source.describe_failures(broken)[:MOST_WARNINGS]:
+            warnings.warn(line, KpbenchWarning, stacklevel=2)
+        raise DataError(f"{out}: lacks {len(broken)} images, which cannot be read; the others are done")
 
 
 def _as_grey_if_colourless(image: UInt8) -> UInt8:

@@ -106,11 +106,12 @@ def predict(
     work = partial(detect_images, dataset, loaded if workers == 1 else detector, threshold)
     found: dict[int, ImageResult] = {}
     ids = dataset.truth.image_id
-    with image_writer(overlay, count) as draw:
+    names = [f"{image_id:08d}.png" for image_id in ids]
+    with image_writer(overlay, count, names=names) as draw:
         for results in run_jobs(work, pieces, workers, progress):
             found.update(results)
         for n in range(count) if overlay is not None else ():
-            draw(f"{ids[n]:08d}.png", draw_detections(dataset.image(n), found[n][0]))
+            draw(names[n], draw_detections(dataset.image(n), found[n][0]))
     labels = [f"image_id {image_id}" for image_id in ids]
     return _collect(loaded, [found[n] for n in range(count)], labels, ids, dataset)
 
@@ -157,7 +158,7 @@ def predict_images(
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels = list[ImageResult](), list[str]()
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
-    with image_writer(overlay, source.length, source.fps) as draw, contextlib.suppress(*ends_by):
+    with image_writer(overlay, source.length, source.fps, source.names) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
             if image is None:
                 result = (Detections.none(), source.problems.get(label, UNDECODABLE))
@@ -167,20 +168,24 @@ def predict_images(
             labels.append(label)
             draw(label, None if image is None else draw_detections(image, result[0]))
             progress(1)
-    return _collect(loaded, found, labels, np.arange(len(found)))
+    return _collect(loaded, found, labels, np.arange(len(found)), source)
 
 
 def _collect(
-    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, dataset: Dataset | None = None
+    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
 ) -> PredictionRun:
-    if found and all(message for _, message in found):
-        raise DataError(
-            f"detector {detector.name}: failed on all {len(found)} images, first {labels[0]}: {found[0][1]}"
-        )
-    about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
-    of_dataset = {} if dataset is None else {"dataset": str(dataset.path), "fingerprint": dataset.fingerprint}
-    predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
     failures = tuple((label, message) for label, (_, message) in zip(labels, found, strict=True) if message)
+    if found and len(failures) == len(found):
+        if isinstance(source, ImageSource):
+            first = source.describe_failures(failures)[0]
+        else:
+            first = f"{source.path}, {labels[0]}: {found[0][1]}"
+        raise DataError(f"detector {detector.name}: failed on all {len(found)} images, first {first}")
+    about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
+    of_dataset = {}
+    if isinstance(source, Dataset):
+        of_dataset = {"dataset": str(source.path), "fingerprint": source.fingerprint}
+    predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
     return PredictionRun(predictions, failures)
 
 

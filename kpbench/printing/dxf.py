@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from kpbench.geometry.outline import Arc, Contour
-from kpbench.printing.page import CUT, LAYERS, PRINT_MARK, Page, split_arc, start_point
+from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
 
 
 def to_dxf(page: Page) -> bytes:
@@ -42,7 +42,7 @@ def to_dxf(page: Page) -> bytes:
         body += [(100, "AcDbText"), *place, (40, 0.7 * t.size), (1, _dxf_text(t.clean)), (71, 2 * t.mirrored)]
         body += [(72, side), *((code + 1, v) for code, v in place if side), (100, "AcDbText")]
     tags = [
-        (999, PRINT_MARK),
+        (999, page.mark),
         *_dxf_head(page, next(handle)),
         (0, "SECTION"),
         (2, "ENTITIES"),

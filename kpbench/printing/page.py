@@ -13,14 +13,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from kpbench.geometry.outline import Arc, Line, Region
 
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
-PRINT_MARK = "kpbench.print/1"
-"""Mark in every file of a print. :func:`kpbench.writing.write_file` replaces an earlier print, which has this mark."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +91,8 @@ class Page:
     shapes : tuple of Shape
     texts : tuple of Text
     title : str
+    mark : str
+        Mark in every file of the page. :func:`kpbench.writing.write_file` replaces only files with the same mark.
 
     Examples
     --------
@@ -108,6 +108,7 @@ class Page:
     shapes: tuple[Shape, ...]
     texts: tuple[Text, ...]
     title: str
+    mark: str = "kpbench.print/1"
 
 
 def round_to_nm(value: float) -> float:
@@ -126,7 +127,7 @@ def mirror_page(page: Page) -> Page:
 
     shapes = tuple(Shape(tuple(tuple(map(flip, c)) for c in s.region), s.layer) for s in page.shapes)
     texts = tuple(Text(t.text, width - t.x, t.y, t.size, t.anchor, not t.mirrored) for t in page.texts)
-    return Page(width, page.height, shapes, texts, page.title)
+    return replace(page, shapes=shapes, texts=texts)
 
 
 def start_point(part: Line | Arc) -> tuple[float, float]:

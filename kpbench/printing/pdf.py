@@ -9,7 +9,7 @@ from typing import Any
 
 from kpbench.geometry.outline import Line, Region
 from kpbench.printing.font import PDF_FONT
-from kpbench.printing.page import CUT, PRINT_MARK, Page, split_arcs, start_point
+from kpbench.printing.page import CUT, Page, split_arcs, start_point
 
 PT_PER_MM = 72 / 25.4
 LONGEST_ARC_DEG = 22.5  # largest sweep of one Bézier curve; the curve deviates from the arc by less than 1e-7 radii
@@ -44,7 +44,7 @@ def to_pdf(pages: Sequence[Page]) -> bytes:
     canvas.setTitle(pages[0].title)
     canvas.setAuthor("kpbench")
     canvas.setCreator("kpbench")
-    canvas.setKeywords(PRINT_MARK)
+    canvas.setKeywords(pages[0].mark)
     canvas.setSubject("True to scale: print at 100 %")
     canvas.setViewerPreference("PrintScaling", "None")
     for page in pages:

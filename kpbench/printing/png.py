@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.printing.font import png_font
-from kpbench.printing.page import CUT, PRINT_MARK, Page, Text
+from kpbench.printing.page import CUT, Page, Text
 
 MAX_PIXELS = 1_000_000_000
 
@@ -83,7 +83,7 @@ def to_png(page: Page, dpi: float) -> bytes:
         ink(round(text.x * scale + left), round(text.y * scale + top), letters)
     out = io.BytesIO()
     mark = PngInfo()
-    mark.add_text("Software", PRINT_MARK)
+    mark.add_text("Software", page.mark)
     Image.fromarray(paper).save(out, "PNG", dpi=(scale * 25.4, scale * 25.4), pnginfo=mark)
     return out.getvalue()
 

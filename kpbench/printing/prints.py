@@ -16,7 +16,7 @@ from kpbench.printing.formats import PAGE_WRITERS
 from kpbench.printing.page_format import PageFormat, parse_page_format
 from kpbench.printing.png import px_per_mm
 from kpbench.printing.sheet import Sheet, board_sheet, patch_sheet
-from kpbench.writing import write_file
+from kpbench.writing import kind_of, require_writable, write_file
 
 Progress = Callable[[int], None]
 
@@ -182,15 +182,17 @@ def save_sheet(sheet: Sheet, folder: str | Path, suffixes: Sequence[str], dpi: f
     sidecar = dict(sheet.sidecar)
     if ".png" in suffixes:
         sidecar["png"] = {"dpi": dpi, "px_per_mm": px_per_mm(dpi)}
-    written = []
+    sidecar_file, files = folder / f"{stem}.json", dict[Path, bytes]()
     for suffix in suffixes:
         contents = PAGE_WRITERS[suffix](sheet.pages, dpi)
         for n, content in enumerate(contents, 1):
-            written.append(folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}")
-            write_file(written[-1], content)
-    written.append(folder / f"{stem}.json")
-    write_file(written[-1], (json.dumps(sidecar, indent=1) + "\n").encode())
-    return written
+            files[folder / f"{stem}{f'-{n}' if len(contents) > 1 else ''}{suffix}"] = content
+    files[sidecar_file] = (json.dumps(sidecar, indent=1) + "\n").encode()
+    for path, content in files.items():  # all of them are looked at before the first is written
+        require_writable(path, kind_of(content, content) or "")
+    for path, content in files.items():
+        write_file(path, content)
+    return [*files]
 
 
 def file_stem(name: str) -> str:

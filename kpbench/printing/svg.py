@@ -6,7 +6,7 @@ from xml.sax.saxutils import escape
 
 from kpbench.geometry.outline import Line, Region
 from kpbench.printing.font import SVG_FONTS
-from kpbench.printing.page import INK, MARKS, PRINT_MARK, Page, Text, round_to_nm, split_arcs, start_point
+from kpbench.printing.page import INK, MARKS, Page, Text, round_to_nm, split_arcs, start_point
 
 
 def _mm(*values: float) -> str:
@@ -49,7 +49,7 @@ def to_svg(page: Page) -> bytes:
     """
     size = f'width="{_mm(page.width)}mm" height="{_mm(page.height)}mm" viewBox="0 0 {_mm(page.width, page.height)}"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
-    lines.append(f"<!-- {PRINT_MARK} -->")
+    lines.append(f"<!-- {page.mark} -->")
     lines.append(f"<title>{escape(Text(page.title, 0, 0, 0).clean)}</title>")
     for layer in (INK, MARKS):
         lines.append(f'<g id="{layer}" fill="#000" fill-rule="nonzero">')
