@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-import shutil
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import groupby
+from itertools import combinations, groupby
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ from kpbench.synth.suite import SuiteConfig
 from kpbench.text import LONGEST_NAME
 from kpbench.types import Predictions
 from kpbench.workers import Progress, run_jobs
-from kpbench.writing import remove_file, remove_leftovers, write_file
+from kpbench.writing import remove_file, remove_leftovers, require_writable, write_file
 
 IMAGES_PER_PART = 32
 """Number of images in a part. Each part has a file of detections until all parts are joined."""
@@ -160,8 +160,8 @@ def bench(
     Raises
     ------
     DataError
-        If a detector cannot be loaded, two detectors have the same name, a dataset cannot be made, or the folder holds
-        other files.
+        If a detector cannot be loaded, the files of two detectors would have the same name, a dataset cannot be made,
+        or the folder holds other files.
 
     Examples
     --------
@@ -180,12 +180,14 @@ def _run_bench(
     suites: Sequence[SuiteConfig], detectors: Sequence[str], out: Path, workers: int | None, progress: Progress
 ) -> list[BenchRun]:
     loaded = {name: load_detector(name) for name in dict.fromkeys(detectors)}
-    labels = [detector.name for detector in loaded.values()]
-    if len(set(labels)) < len(labels):
-        raise DataError(f"two detectors share a name, among: {', '.join(labels)}")
+    _refuse_equal_files([detector.name for detector in loaded.values()])
+    for suite in suites:
+        for path, kind in _report_files(suite.suite.name, [d.name for d in loaded.values()], out).items():
+            if path.exists():
+                require_writable(path, kind)
     datasets: dict[SuiteConfig, Dataset] = {}
     runs: list[tuple[SuiteConfig, Dataset, Path]] = []
-    parts: list[_Part] = []
+    parts: dict[Path, list[_Part]] = {}
     for suite in suites:
         for name, detector in loaded.items():
             config = replace(suite, board=detector.board)
@@ -193,22 +195,45 @@ def _run_bench(
                 datasets[config] = _make_dataset(config, out / "suites", workers, progress)
             dataset = datasets[config]
             folder = out / "predictions" / f"{config.name}-{dataset.fingerprint[:8]}"
-            stem = re.sub(r"[^A-Za-z0-9.]+", "-", detector.name)[:LONGEST_NAME]
-            file = folder / f"{stem}-{_digest_detector(detector)[:8]}.json"
+            file = folder / f"{_file_stem(detector.name)}-{_digest_detector(detector)[:8]}.json"
+            about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
             runs.append((config, dataset, file))
+            planned = _plan_parts(dataset, name, about, file)
             if detector.identity is None:
-                _remove_predictions(file)
+                remove_file(file, "predictions")
+                _remove_parts(planned)
             if file.exists():
+                require_writable(file, "predictions")
                 progress(len(dataset))
             else:
-                about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
-                parts += _plan_parts(dataset, name, about, file)
+                _prepare_parts(planned)
+                parts[file] = planned
     warn_of_opencv()
-    _detect_parts(parts, workers, progress)
-    for _, _, file in runs:
-        if not file.exists():
-            _join_parts(file)
+    _detect_parts([part for planned in parts.values() for part in planned], workers, progress)
+    for file, planned in parts.items():
+        _join_parts(planned, file)
     return [_score_run(*run) for run in runs]
+
+
+def _file_stem(detector: str) -> str:
+    """Return the name of a detector as the start of a file name."""
+    return re.sub(r"[^A-Za-z0-9.]+", "-", detector)[:LONGEST_NAME]
+
+
+def _refuse_equal_files(detectors: Sequence[str]) -> None:
+    """Raise an error if the files of two detectors would have one name."""
+    for one, two in combinations(detectors, 2):
+        if _file_stem(one).casefold() == _file_stem(two).casefold():
+            raise DataError(
+                f"the scores of the detectors {one!r} and {two!r} would be one file, {_file_stem(one)}.json; "
+                "give them other names, or run each with an `out` of its own"
+            )
+
+
+def _report_files(suite: str, detectors: Sequence[str], out: Path) -> dict[Path, str]:
+    """Return the files that :func:`write_suite_reports` writes for a suite, and their kinds."""
+    scores = [out / "scores" / suite / f"{_file_stem(name)}.json" for name in detectors]
+    return {out / f"{suite}.html": "report", out / f"{suite}.md": "report"} | dict.fromkeys(scores, "scores")
 
 
 def _make_dataset(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
@@ -226,19 +251,8 @@ def _digest_detector(detector: LoadedDetector) -> str:
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
-def _remove_predictions(file: Path) -> None:
-    """Remove a predictions file and its parts."""
-    remove_file(file, "predictions")
-    shutil.rmtree(_parts_folder(file), ignore_errors=True)
-
-
-def _parts_folder(file: Path) -> Path:
-    return file.with_suffix(".parts")
-
-
 def _plan_parts(dataset: Dataset, detector: str, description: dict[str, Any], file: Path) -> list[_Part]:
-    """Return the parts of a predictions file, and make the folder for the files of the parts."""
-    folder = make_folder(_parts_folder(file))
+    """Return the parts of a predictions file."""
     return [
         _Part(
             dataset.path,
@@ -246,10 +260,34 @@ def _plan_parts(dataset: Dataset, detector: str, description: dict[str, Any], fi
             description,
             first,
             min(IMAGES_PER_PART, len(dataset) - first),
-            folder / f"{first:08d}.json",
+            file.with_suffix(".parts") / f"{first:08d}.json",
         )
         for first in range(0, len(dataset), IMAGES_PER_PART)
     ]
+
+
+def _prepare_parts(parts: Sequence[_Part]) -> None:
+    """Make the folder for the files of the parts, and refuse files in it that kpbench did not write.
+
+    The folder is no symbolic link: the files behind a link may be those of another run.
+    """
+    folder = parts[0].file.parent
+    if folder.is_symlink():
+        raise DataError(f"{folder}: is a symbolic link, expected a folder of this run; remove the link")
+    make_folder(folder)
+    for part in parts:
+        require_writable(part.file, "predictions")
+
+
+def _remove_parts(parts: Sequence[_Part]) -> None:
+    """Remove the files of the parts, and their folder if nothing else lies in it."""
+    folder = parts[0].file.parent
+    if folder.is_symlink():
+        return
+    for part in parts:
+        remove_file(part.file, "predictions")
+    with suppress(OSError):  # a file of the user's
+        folder.rmdir()
 
 
 def _detect_parts(parts: Sequence[_Part], workers: int | None, progress: Progress) -> None:
@@ -287,16 +325,16 @@ def _open_once(path: Path) -> Dataset:
     return open_dataset(path)
 
 
-def _join_parts(file: Path) -> None:
+def _join_parts(planned: Sequence[_Part], file: Path) -> None:
     """Write a predictions file from its parts, and remove the parts."""
-    parts = [read_predictions(path) for path in sorted(_parts_folder(file).glob("*.json"))]
+    parts = [read_predictions(part.file) for part in planned]
     failures = [failure for part in parts for failure in part.detector.get("failures", [])]
     description = parts[0].detector | _describe_failures(failures)
     found = [detections for part in parts for detections in part.detections()]
     ids = np.concatenate([part.image_id for part in parts])
     predictions = Predictions.from_detections(found, ids, description, parts[0].dataset, parts[0].fingerprint)
     write_predictions(file, predictions)
-    shutil.rmtree(_parts_folder(file))
+    _remove_parts(planned)
 
 
 def _score_run(config: SuiteConfig, dataset: Dataset, file: Path) -> BenchRun:

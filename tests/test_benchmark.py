@@ -152,7 +152,7 @@ def test_the_command_tells_the_difference_to_the_paper(here):
 
 def test_two_detectors_of_one_name_are_refused(here):
     (here / "mine.py").write_text(DETECTOR + "class A:\n    name = 'aruco'\n    detect = staticmethod(corners)\n")
-    with pytest.raises(DataError, match="two detectors share a name, among: aruco, aruco"):
+    with pytest.raises(DataError, match=r"the detectors 'aruco' and 'aruco' would be one file, aruco\.json"):
         bench([SMALL], ["aruco", "mine:A"], "out")
 
 
