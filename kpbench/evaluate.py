@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -317,7 +318,7 @@ def _find_dataset(
         return open_coco(path) if path.suffix.lower() == ".json" and path.name != MANIFEST else open_dataset(truth)
     named = predictions.dataset
     for folder in (Path(named), file.parent / named) if named else ():
-        if folder.exists():
+        if os.path.exists(folder):  # Path.exists raises an error for a name that is too long
             return open_dataset(folder)
     problem = f"names the dataset {named!r}, which is not here" if named else "names no dataset"
     if not DEFAULT_DATASET.exists():

@@ -29,10 +29,16 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
     Examples:
       kpbench demo
     """
+    from kpbench.detectors.interface import load_detector
     from kpbench.files import require_own_folder
+    from kpbench.writing import require_writable
 
     require_own_folder(out, "print", "the demo")
+    load_detector(detector)  # which fails before the images are made, if it fails
     data, preds = out / "data", out / "preds.json"
+    for file, kind in ((preds, "predictions"), (out / "contact-sheet.png", "picture"), (out / "scores.json", "scores")):
+        if file.exists():
+            require_writable(file, kind)
     photographs = ["--backgrounds", str(backgrounds)] if backgrounds else []
     steps = [
         ("print the patches", ["render-patches", "--pdf", "--png", "--dpi", "150", "--out", str(out / "print")]),

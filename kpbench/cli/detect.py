@@ -70,7 +70,7 @@ def detect(
     from kpbench.predictions.files import require_predictions_path, write_predictions
 
     if patches and detector != "template":
-        raise click.UsageError(f"--patches is for the template detector; {detector} has designs of its own")
+        raise click.UsageError(f"--patches is for the template detector; {detector} does not take designs")
     require_predictions_path(out)
     images = open_source(source, overlay)
     if detector in SHIPPED_DESIGNS_ONLY and not patches and has_other_designs(images):

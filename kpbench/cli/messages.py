@@ -6,6 +6,7 @@ import re
 
 import click
 
+from kpbench.errors import one_line
 from kpbench.text import escape_terminal
 
 OPTION_OF = {
@@ -21,13 +22,15 @@ def echo(text: object = "", *, lines: bool = False, err: bool = False, bold: boo
 
     File names and names in files may hold anything. Control characters, escape sequences and line feeds are therefore
     printed as escapes such as ``\\x1b``. With ``lines``, the text is a table or has several lines, and line feeds stay.
+    A message to stderr is one line of moderate length, see :func:`kpbench.errors.one_line`.
     """
-    click.secho(escape_terminal(str(text), lines), err=err, bold=bold)
+    shown = escape_terminal(str(text), lines)
+    click.secho(one_line(shown) if err else shown, err=err, bold=bold)
 
 
 def clean_usage_error(error: click.ClickException) -> click.ClickException:
     """Return an error that click will print itself, with the message as :func:`echo` would print it."""
-    text = escape_terminal(error.format_message(), lines=True)
+    text = "\n".join(map(one_line, escape_terminal(error.format_message(), lines=True).split("\n")))
     error.format_message = lambda: text  # type: ignore[method-assign]
     return error
 

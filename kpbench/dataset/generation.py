@@ -22,7 +22,7 @@ from typing import Any
 
 from kpbench.dataset.card import write_card
 from kpbench.dataset.config import DatasetConfig
-from kpbench.dataset.folder import Dataset, ShardEntry, make_manifest, open_dataset, write_manifest
+from kpbench.dataset.folder import MANIFEST, Dataset, ShardEntry, make_manifest, open_dataset, write_manifest
 from kpbench.dataset.resume import (
     FinishedShard,
     PlannedShard,
@@ -32,6 +32,7 @@ from kpbench.dataset.resume import (
     plan_shards,
     prepare_folder,
     read_shard_head,
+    refuse_resume_with_overwrite,
 )
 from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
@@ -39,7 +40,7 @@ from kpbench.files import folder_at, load_json, make_folder
 from kpbench.locks import lock_folder
 from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.workers import Progress, dask_executor, run_jobs
-from kpbench.writing import remove_leftovers, require_space, write_file
+from kpbench.writing import remove_leftovers, require_space, require_writable, write_file
 
 
 @dataclass(frozen=True)
@@ -107,8 +108,8 @@ def generate(
     Raises
     ------
     DataError
-        If the folder holds another dataset or other files, another run is writing to it, the disk is full, or a worker
-        dies. Finished shards stay, and the message says how to resume.
+        If both ``resume`` and ``overwrite`` are set, the folder holds another dataset or other files, another run is
+        writing to it, the disk is full, or a worker dies. Finished shards stay, and the message says how to resume.
 
     Examples
     --------
@@ -117,6 +118,7 @@ def generate(
     >>> len(dataset), dataset.image(0).shape
     (2, (64, 64))
     """
+    refuse_resume_with_overwrite(resume, overwrite)
     with _open_executor(executor, scheduler) as executor:
         folder, written = make_folder(folder_at(out)), config.to_dict()
         # before a plan of a billion images is made and compared with the folder
@@ -174,6 +176,7 @@ def generate_part(
     >>> len(merge("four"))
     4
     """
+    refuse_resume_with_overwrite(resume, overwrite)
     images = min(config.n, len(shards) * config.shard_size)
     require_space(make_folder(folder_at(out)), images * config.image_bytes, f"{images} images", of_empty_disk=True)
     plan = plan_shards(config.n, config.shard_size)
@@ -222,6 +225,7 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     2
     """
     folder = make_folder(folder_at(out))
+    require_writable(folder / MANIFEST, "dataset")
     with lock_folder(folder):
         for part in map(folder_at, parts):
             for path in sorted(part.glob("shard-*.h5")):

@@ -14,7 +14,7 @@ from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
 from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
 from kpbench.files import load_json, sha256_of
-from kpbench.writing import is_replaceable, remove_file, remove_leftovers, require_removable
+from kpbench.writing import is_replaceable, remove_file, remove_leftovers, require_removable, require_writable
 
 MOST_SHARDS = 4_000_000
 """Largest number of shards of a dataset."""
@@ -58,6 +58,18 @@ def plan_shards(n: int, shard_size: int) -> list[PlannedShard]:
     return [PlannedShard(f"shard-{k:05d}.h5", first, min(shard_size, n - first)) for k, first in enumerate(firsts)]
 
 
+def refuse_resume_with_overwrite(resume: bool, overwrite: bool) -> None:
+    """Raise an error if both are set: the one keeps the finished shards that the other deletes.
+
+    Raises
+    ------
+    DataError
+        The message names both parameters.
+    """
+    if resume and overwrite:
+        raise DataError("`resume=True` and `overwrite=True` exclude each other, expected one of them")
+
+
 def prepare_folder(
     folder: Path, config: dict[str, Any], plan: Sequence[PlannedShard], resume: bool, overwrite: bool
 ) -> dict[str, FinishedShard]:
@@ -82,7 +94,8 @@ def prepare_folder(
     ------
     DataError
         If the folder holds files, but neither a manifest nor shards. If the folder holds a manifest or planned shards,
-        and neither ``resume`` nor ``overwrite`` is set. If a shard belongs to another dataset or is damaged.
+        and neither ``resume`` nor ``overwrite`` is set. If kpbench did not write the manifest. If a shard belongs to
+        another dataset or is damaged.
     """
     manifest, names = folder / MANIFEST, {shard.file for shard in plan}
     entries = [path for path in folder.glob("*") if not path.name.startswith(".")]
@@ -104,8 +117,10 @@ def prepare_folder(
         problem = "already holds a dataset" if manifest.exists() else "holds an unfinished dataset"
         remedy = "add `resume=True` to finish it, `overwrite=True` to replace it, or another `out`"
         raise DataError(f"{folder}: {problem}; {remedy}")
+    else:
+        require_writable(manifest, "dataset")  # which would be refused after all shards are made
     remove_leftovers(folder / name for name in names)
-    if overwrite or not resume:
+    if not resume:
         return {}
     for path in concerned:
         if path.name not in names:

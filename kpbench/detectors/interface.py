@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from kpbench import __version__
-from kpbench.detectors.program import run_program
+from kpbench.detectors.program import run_program, split_command
 from kpbench.errors import DataError
 from kpbench.opencv import opencv_version
 from kpbench.patches.design import Patch
@@ -159,7 +159,9 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     if patches is not None and name != "template":
         raise DataError(f"`patches` can be given only to the detector template, not to {name}")
     if name.startswith(PROGRAM_PREFIX):
-        run_many = partial(run_program, name.removeprefix(PROGRAM_PREFIX).strip())
+        command = name.removeprefix(PROGRAM_PREFIX).strip()
+        split_command(command)  # refuses what cannot be started, before any image is made
+        run_many = partial(run_program, command)
         return LoadedDetector(name, "unknown", lambda image: run_many([image])[0], run_many=run_many)
     if name.endswith(".onnx"):
         made = _set_threshold(_import_attribute(DETECTORS["superpoint"])(Path(name)), threshold)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -40,6 +41,23 @@ def _run(words: Sequence[str], stderr: Path) -> tuple[int, str]:
     return code, stderr.read_text("utf-8", errors="replace")
 
 
+def split_command(command: str) -> list[str]:
+    """Return the program and the arguments of a command, quoted as for a shell.
+
+    Raises
+    ------
+    DataError
+        If there is no such program that may be executed, or a quotation does not end.
+    """
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise DataError(f"{command}: no command, {error}") from None
+    if not words or shutil.which(words[0]) is None:
+        raise DataError(f"{command}: there is no program {words[0] if words else ''!r} that may be executed")
+    return words
+
+
 def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
     """Run ``COMMAND FOLDER FILE`` over images.
 
@@ -71,11 +89,11 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
         for n, image in enumerate(images):
             if not cv2.imwrite(str(folder / f"{n:08d}.png"), image if image.ndim == 2 else image[..., ::-1]):
                 raise DataError(f"{folder}: cannot be written, is the disk full?")
-        code, stderr = _run([*shlex.split(command), str(folder), str(out)], Path(scratch) / "stderr")
+        code, stderr = _run([*split_command(command), str(folder), str(out)], Path(scratch) / "stderr")
         if code:
             lines = stderr.strip().splitlines() or ["nothing on stderr"]
             raise DataError(f"{command}: exit code {code}, {lines[-1]}")
-        if not out.exists():
+        if not out.is_file():  # nothing, a folder, or a pipe, which would block the reader
             raise DataError(f"{command}: wrote no predictions file where its last argument says")
         found = read_predictions(out)
     by_image = dict(zip(found.image_id.tolist(), found.detections(), strict=True))

@@ -34,7 +34,7 @@ def test_the_ellipse_network_is_trained_and_written(small_dataset, tmp_path):
     log_odds, shift, log_map = outputs(tmp_path / "ellipse.onnx", surroundings=SURROUNDINGS)
     assert (log_odds.shape, shift.shape, log_map.shape) == ((3,), (3, 2), (3, 2, 2))
     assert lines[0].startswith("train on ")
-    assert lines[-1].endswith("ellipse.onnx: 1380375 bytes")
+    assert lines[-1].endswith("ellipse.onnx: 1380387 bytes")
 
 
 def test_the_judges_are_trained_and_written(small_dataset, tmp_path):
@@ -53,6 +53,15 @@ def test_a_training_from_the_shipped_weights_begins_with_what_they_give(small_da
     ours, shipped = (outputs(file, surroundings=SURROUNDINGS) for file in files)
     for one, other in zip(ours[1:], shipped[1:], strict=True):  # the log odds are calibrated anew
         assert np.abs(one - other).max() < 0.1
+
+
+def test_a_network_replaces_an_earlier_one_and_a_foreign_file_is_refused_before_the_training(small_dataset, tmp_path):
+    for _ in range(2):
+        train_ellipse([small_dataset], small_dataset, tmp_path, epochs=0, from_shipped=True, workers=0, threads=1)
+    for train, name in ((train_ellipse, "ellipse"), (train_judges, SECOND_JUDGE)):
+        (tmp_path / f"{name}.onnx").write_bytes(b"of the user")
+        with pytest.raises(kpbench.KpbenchError, match=f"{name}.onnx: exists, and kpbench did not write it"):
+            train([], small_dataset, tmp_path, workers=0, threads=1)
 
 
 def test_draws_depend_on_the_images_and_not_on_how_the_folder_is_called(small_dataset, tmp_path, monkeypatch):

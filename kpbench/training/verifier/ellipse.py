@@ -37,6 +37,7 @@ from kpbench.training.verifier.small_networks import (
     BATCHNORM_SAMPLES,
     CONTINUED_LEARNING_RATE,
     LEARNING_RATE,
+    NETWORK_KIND,
     Say,
     load_shipped,
     train_one_cycle,
@@ -44,6 +45,7 @@ from kpbench.training.verifier.small_networks import (
     write_network,
 )
 from kpbench.types import Float, Float32, Int
+from kpbench.writing import require_writable
 
 ON_PATCH, OFF_PATCH = 0.6, 1.0
 """A place within 0.6 short semi-axes of a patch's centre lies on the patch. A place further than 1.0 long semi-axes
@@ -159,7 +161,7 @@ def train_ellipse(
     >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
     >>> train_ellipse(sets, kpbench.open_dataset("set-3"), Path("ellipse"), say=print)  # doctest: +SKIP
     """
-    make_folder(out)
+    require_writable(make_folder(out) / f"{ELLIPSE}.onnx", NETWORK_KIND)
     if threads:
         torch.set_num_threads(threads)
     parts: list[Places] = []

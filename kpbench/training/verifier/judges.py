@@ -44,12 +44,14 @@ from kpbench.training.verifier.small_networks import (
     BATCHNORM_SAMPLES,
     CONTINUED_LEARNING_RATE,
     LEARNING_RATE,
+    NETWORK_KIND,
     Say,
     load_shipped,
     train_one_cycle,
     write_network,
 )
 from kpbench.types import Float
+from kpbench.writing import require_writable
 
 FIRST_WIDTH, SECOND_WIDTH = 32, 48
 """Number of channels of the first layers: of the first judge, and of the second judge."""
@@ -94,7 +96,8 @@ def train_judges(
     >>> sets = [kpbench.open_dataset(name) for name in ("set-1", "set-2")]  # doctest: +SKIP
     >>> train_judges(sets, kpbench.open_dataset("set-3"), Path("judges"), say=print)  # doctest: +SKIP
     """
-    make_folder(out)
+    for name in (FIRST_JUDGE, SECOND_JUDGE):
+        require_writable(make_folder(out) / f"{name}.onnx", NETWORK_KIND)
     if threads:
         torch.set_num_threads(threads)
     patches, sets = load_places_detector(detector).patches, [*datasets, test]

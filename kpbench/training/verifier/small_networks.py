@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -134,6 +135,10 @@ def load_shipped(network: nn.Module, name: str, seen: tuple[Tensor, ...]) -> Non
         batch_norm.bias.add_(torch.from_numpy(stored[node.input[2]]))
 
 
+NETWORK_KIND = "verifier"
+"""Kind of the files of networks, see :mod:`kpbench.writing`."""
+
+
 def write_network(
     network: nn.Module, inputs: Sequence[str], seen: Sequence[tuple[Tensor, ...]], file: Path, say: Say
 ) -> None:
@@ -164,6 +169,8 @@ def write_network(
             dynamic_axes={name: {0: "places"} for name in [*inputs, *OUTPUTS]},
         )
     feeds = (dict(zip(inputs, (part.numpy() for part in one), strict=True)) for one in seen)
-    data = bytes(quantise(onnx.load_from_string(buffer.getvalue()), feeds).SerializeToString())
+    quantised = quantise(onnx.load_from_string(buffer.getvalue()), feeds)
+    onnx.helper.set_model_props(quantised, {"kpbench": json.dumps({"schema": f"kpbench.{NETWORK_KIND}/1"})})
+    data = bytes(quantised.SerializeToString())
     write_file(file, data)
     say(f"{file}: {len(data)} bytes")
