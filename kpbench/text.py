@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from html import escape
 
 LONGEST_NAME = 100
 NAME_RULE = (
@@ -38,6 +39,11 @@ def escape_terminal(text: str, lines: bool = False) -> str:
     )
 
 
+def replace_unprinted(text: str) -> str:
+    """Return a text for paper, with a question mark in place of each character that is not printed."""
+    return "".join(c if c.isprintable() else "?" for c in text)
+
+
 LATEX_OF = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -64,15 +70,53 @@ def escape_markdown(text: str) -> str:
     return re.sub(r"[\\`*\[\]<>|~$]|&(?=[#\w])|(?<!\w)_|_(?!\w)", r"\\\g<0>", escape_terminal(text))
 
 
+def escape_markup(text: str) -> str:
+    """Return a text for XML, SVG and HTML, within an element or an attribute, in one line.
+
+    Escapes stand for the control characters, which XML forbids.
+    """
+    return escape(escape_terminal(text))
+
+
+def escape_yaml(text: str) -> str:
+    r"""Return a text as a scalar of YAML in quotation marks, in one line. The scalar is also a string of TOML.
+
+    JSON is no substitute: it writes a character above U+FFFF as two halves, which YAML does not join.
+    """
+    whole = text.encode(errors="backslashreplace").decode()
+    marked = whole.replace("\\", r"\\").replace('"', r"\"")
+    return '"' + "".join(c if c.isprintable() else _unicode_escape(c) for c in marked) + '"'
+
+
+def _unicode_escape(c: str) -> str:
+    return f"\\u{ord(c):04x}" if ord(c) < 0x10000 else f"\\U{ord(c):08x}"
+
+
+def escape_dxf(text: str) -> str:
+    r"""Return a text for DXF in ASCII. ``\U+`` and four hexadecimal digits stand for every other character.
+
+    ``\`` and ``^`` would start a code of DXF, and are written so too. ``%%`` would start one, and becomes ``% %``.
+    Characters from U+10000 up do not fit into four digits and are dropped.
+    """
+    units = (c if c.isascii() and c.isprintable() and c not in "\\^" else f"\\U+{ord(c):04X}" for c in text)
+    return "".join(unit for unit in units if len(unit) <= 7).replace("%%", "% %")
+
+
+FORMULA = "=+@\uff1d\uff0b\uff0d\uff20-"
+"""Characters that begin a formula, also in their wide forms."""
+CELL = r"(?:^|[,;|])[\s\"\\]*"
+"""How a cell begins. Spreadsheets split lines at , or ; as the language of the machine is, and also inside of texts."""
+
+
 def escape_csv(value: object) -> object:
     """Return the value of a cell in one line, which no spreadsheet takes for a formula.
 
-    A text that begins with =, +, - or @ gets a ``'`` before it. Numbers stay as they are.
+    A ``'`` stands before each character of ``FORMULA`` that begins the text, or that follows a comma, a semicolon or a
+    ``|``. Numbers stay as they are.
     """
     if not isinstance(value, str):
         return value
-    text = escape_terminal(value)
-    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+    return re.sub(f"({CELL})(?=[{FORMULA}])", r"\1'", escape_terminal(value))
 
 
 def escape_csv_comment(text: str) -> str:
@@ -80,4 +124,8 @@ def escape_csv_comment(text: str) -> str:
 
     The first character of such a cell becomes an escape of JSON, such as ``\u003d``.
     """
-    return re.sub(r"(?<=[,;])[=+@-]", lambda found: f"\\u{ord(found[0]):04x}", text)
+
+    def escape_string(string: re.Match[str]) -> str:
+        return '"' + re.sub(f"({CELL})([{FORMULA}])", lambda m: f"{m[1]}\\u{ord(m[2]):04x}", string[0][1:-1]) + '"'
+
+    return re.sub(r'"(?:[^"\\]|\\.)*"', escape_string, text)

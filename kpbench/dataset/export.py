@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from kpbench.dataset.card import patch_names, write_card
 from kpbench.dataset.folder import Dataset
 from kpbench.errors import DataError
-from kpbench.files import make_folder
+from kpbench.files import escape_surrogates, make_folder
 from kpbench.geometry.homography import project_disc_boxes
 from kpbench.images import encode_png
 from kpbench.locks import LOCK_FILE, lock_folder
+from kpbench.text import escape_yaml
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
 from kpbench.writing import remove_file, require_space, write_file
@@ -128,7 +129,13 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
             })  # fmt: skip
         progress(1)
     categories = [
-        {"id": patch_id + 1, "name": name, "supercategory": "patch", "keypoints": ["centre"], "skeleton": []}
+        {
+            "id": patch_id + 1,
+            "name": escape_surrogates(name),
+            "supercategory": "patch",
+            "keypoints": ["centre"],
+            "skeleton": [],
+        }
         for patch_id, name in patch_names(dataset).items()
     ]
     # `kpbench score` compares this fingerprint with the fingerprint in the predictions
@@ -165,7 +172,7 @@ def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
         write_file(folder / "images" / f"{ids[n]:08d}.png", encode_png(image, IMAGE_KIND))
         write_file(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
-    listing = "".join(f"  {classes[patch_id]}: {json.dumps(name)}\n" for patch_id, name in names.items())
+    listing = "".join(f"  {classes[patch_id]}: {escape_yaml(name)}\n" for patch_id, name in names.items())
     # without a key `path`, YOLO looks for the folders beside this file
     text = f"# {EXPORT_MARK}\ntrain: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listing}"
     write_file(folder / "data.yaml", text.encode())

@@ -12,6 +12,7 @@ from typing import Any
 
 from kpbench.geometry.outline import Arc, Contour
 from kpbench.printing.page import CUT, LAYERS, Page, split_arc, start_point
+from kpbench.text import escape_dxf
 
 
 def to_dxf(page: Page) -> bytes:
@@ -39,7 +40,7 @@ def to_dxf(page: Page) -> bytes:
         side = {"start": 0, "middle": 1, "end": 2}[t.anchor]
         place = [(10, t.x), (20, page.height - t.y), (30, 0.0)]
         body += [(0, "TEXT"), (5, f"{next(handle):X}"), (330, "1F"), (100, "AcDbEntity"), (8, "TEXT")]
-        body += [(100, "AcDbText"), *place, (40, 0.7 * t.size), (1, _dxf_text(t.clean)), (71, 2 * t.mirrored)]
+        body += [(100, "AcDbText"), *place, (40, 0.7 * t.size), (1, escape_dxf(t.clean)), (71, 2 * t.mirrored)]
         body += [(72, side), *((code + 1, v) for code, v in place if side), (100, "AcDbText")]
     tags = [
         (999, page.mark),
@@ -55,16 +56,6 @@ def to_dxf(page: Page) -> bytes:
 
 def _dxf_value(value: Any) -> str:
     return f"{value:.9f}" if isinstance(value, float) else str(value)
-
-
-def _dxf_text(text: str) -> str:
-    """Return the text with escapes for characters outside ASCII.
-
-    An escape holds four hexadecimal digits. Characters from U+10000 up do not fit and are dropped. ``%%`` would start a
-    control code, and is written as ``% %``.
-    """
-    units = "".join(c if c.isascii() else f"\\U+{ord(c):04X}" for c in text if ord(c) < 0x10000)
-    return units.replace("%%", "% %")
 
 
 def _dxf_vertices(contour: Contour, height: float) -> list[tuple[int, Any]]:

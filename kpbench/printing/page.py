@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 from kpbench.geometry.outline import Arc, Line, Region
+from kpbench.text import replace_unprinted
 
 INK, MARKS, CUT = "INK", "MARKS", "CUT"
 LAYERS = (INK, MARKS, CUT)
@@ -77,7 +78,7 @@ class Text:
     @property
     def clean(self) -> str:
         """The text with a question mark in place of each character that is not printable."""
-        return "".join(c if c.isprintable() else "?" for c in self.text)
+        return replace_unprinted(self.text)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import Any
 from kpbench.geometry.outline import Line, Region
 from kpbench.printing.font import PDF_FONT
 from kpbench.printing.page import CUT, Page, split_arcs, start_point
+from kpbench.text import replace_unprinted
 
 PT_PER_MM = 72 / 25.4
 LONGEST_ARC_DEG = 22.5  # largest sweep of one Bézier curve; the curve deviates from the arc by less than 1e-7 radii
@@ -41,7 +42,7 @@ def to_pdf(pages: Sequence[Page]) -> bytes:
     pdfmetrics.registerFont(font)
     out = io.BytesIO()
     canvas = Canvas(out, invariant=1, pageCompression=0, initialFontName=PDF_FONT, lang="en")
-    canvas.setTitle(pages[0].title)
+    canvas.setTitle(replace_unprinted(pages[0].title))
     canvas.setAuthor("kpbench")
     canvas.setCreator("kpbench")
     canvas.setKeywords(pages[0].mark)

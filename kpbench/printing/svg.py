@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from xml.sax.saxutils import escape
-
 from kpbench.geometry.outline import Line, Region
 from kpbench.printing.font import SVG_FONTS
-from kpbench.printing.page import INK, MARKS, Page, Text, round_to_nm, split_arcs, start_point
+from kpbench.printing.page import INK, MARKS, Page, round_to_nm, split_arcs, start_point
+from kpbench.text import escape_markup, replace_unprinted
 
 
 def _mm(*values: float) -> str:
@@ -50,7 +49,7 @@ def to_svg(page: Page) -> bytes:
     size = f'width="{_mm(page.width)}mm" height="{_mm(page.height)}mm" viewBox="0 0 {_mm(page.width, page.height)}"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<svg xmlns="http://www.w3.org/2000/svg" {size}>']
     lines.append(f"<!-- {page.mark} -->")
-    lines.append(f"<title>{escape(Text(page.title, 0, 0, 0).clean)}</title>")
+    lines.append(f"<title>{escape_markup(replace_unprinted(page.title))}</title>")
     for layer in (INK, MARKS):
         lines.append(f'<g id="{layer}" fill="#000" fill-rule="nonzero">')
         lines += [f'<path d="{_svg_path(s.region)}"/>' for s in page.shapes if s.layer == layer]
@@ -58,5 +57,7 @@ def to_svg(page: Page) -> bytes:
     lines.append(f'<g id="TEXT" font-family="{SVG_FONTS}">')
     for t in page.texts:
         place = f'transform="matrix(-1 0 0 1 {_mm(t.x, t.y)})"' if t.mirrored else f'x="{_mm(t.x)}" y="{_mm(t.y)}"'
-        lines.append(f'<text {place} font-size="{_mm(t.size)}" text-anchor="{t.anchor}">{escape(t.clean)}</text>')
+        lines.append(
+            f'<text {place} font-size="{_mm(t.size)}" text-anchor="{t.anchor}">{escape_markup(t.clean)}</text>'
+        )
     return "\n".join([*lines, "</g>", "</svg>", ""]).encode()

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from html import escape
 from typing import TypeVar
+
+from kpbench.text import escape_markup
 
 CHART_COLOURS = 9
 """Number of line colours, which have the CSS classes s0 to s8. Further series reuse the colours with dashed lines."""
@@ -130,7 +131,7 @@ def line_chart(
     parts.append(_text((PLOT_LEFT + PLOT_RIGHT) / 2, CHART_HEIGHT - 8, x_label, "middle"))
     middle = (PLOT_TOP + PLOT_BOTTOM) / 2
     parts.append(
-        f'<text text-anchor="middle" transform="translate(13 {middle:.1f}) rotate(-90)">{escape(y_label)}</text>'
+        f'<text text-anchor="middle" transform="translate(13 {middle:.1f}) rotate(-90)">{escape_markup(y_label)}</text>'
     )
     for s in series:
         parts += _draw_series(s, to_px, to_py, markers)
@@ -155,7 +156,7 @@ def _draw_series(
         if y is not None:
             text = f"{s.name}: {y:.3f}" + (f" [{i[0]:.3f}, {i[1]:.3f}]" if i else "") + f" at {x:g}"
             dot = f'<circle class="{colour}" cx="{to_px(x):.1f}" cy="{to_py(y):.1f}" r="3">'
-            parts.append(f"{dot}<title>{escape(text)}</title></circle>")
+            parts.append(f"{dot}<title>{escape_markup(text)}</title></circle>")
     return parts
 
 
@@ -207,18 +208,18 @@ def bar_chart(rows: Sequence[tuple[str, Sequence[int]]], kinds: Sequence[str], s
             if count:
                 size = f'width="{part_width:.1f}" height="{BAR_HEIGHT - 6}"'
                 box = f'<rect class="s{style % CHART_COLOURS}" x="{x:.1f}" y="{y + 3}" {size}>'
-                parts.append(f"{box}<title>{escape(text)}</title></rect>")
+                parts.append(f"{box}<title>{escape_markup(text)}</title></rect>")
             x += part_width
     return _svg(CHART_WIDTH, len(rows) * BAR_HEIGHT, f"Shares of {', '.join(kinds)}", parts)
 
 
 def _svg(width: float, height: float, label: str, parts: Iterable[str]) -> str:
     box = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
-    return f'<svg class="chart" role="img" aria-label="{escape(label)}" {box}>{"".join(parts)}</svg>'
+    return f'<svg class="chart" role="img" aria-label="{escape_markup(label)}" {box}>{"".join(parts)}</svg>'
 
 
 def _text(x: float, y: float, text: str, anchor: str) -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(text)}</text>'
+    return f'<text x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape_markup(text)}</text>'
 
 
 def _round_numbers(low: float, high: float) -> list[float]:

@@ -273,10 +273,15 @@ def _describe_images(report: Report) -> str:
 def to_html(report: Report) -> str:
     """Render a report as one page of HTML that loads no other file: styles, script, charts and pictures are inside."""
     import jinja2
+    from markupsafe import Markup
+
+    def clean(value: object) -> object:
+        """Escape what no page may hold, before jinja2 escapes the markup."""
+        return escape_terminal(value, lines=True) if isinstance(value, str) and not isinstance(value, Markup) else value
 
     folder = Path(__file__).parent / "templates"
     environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
+        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined, finalize=clean
     )
     template = environment.from_string((folder / "report.html").read_text("utf-8"))
     style = (folder / "report.css").read_text("utf-8") + CHART_STYLE
