@@ -97,16 +97,30 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
         raise error(f"{str(path)!r}: no file can have this name") from None
 
 
+class DoubleKeyError(ValueError):
+    """An object of a JSON text has a key twice. Readers disagree which of the two values counts."""
+
+
+def _require_single_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) < len(pairs):
+        keys = [key for key, _ in pairs]
+        double = next(key for n, key in enumerate(keys) if key in keys[:n])
+        start = ", ".join(f"{key!r}: {str(value)[:20]}" for key, value in pairs[:2])
+        raise DoubleKeyError(f"the key {double!r} is there twice in {{{start[:80]}, ...}}")
+    return content
+
+
 def load_json(text: str | bytes) -> Any:
     """Return the content of a JSON text.
 
     Raises
     ------
     ValueError
-        If the text is no JSON, or is nested too deeply.
+        If the text is no JSON, or is nested too deeply. If an object has a key twice (:class:`DoubleKeyError`).
     """
     try:
-        return json.loads(text)
+        return json.loads(text, object_pairs_hook=_require_single_keys)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
 

@@ -55,7 +55,7 @@ def write_dataset(folder, images, condition="", seed=0):
     path = folder / "shard-00000.h5"
     write_file(path, encode_shard(samples, len(samples), config))
     entry = ShardEntry(path.name, 0, len(samples), path.stat().st_size, sha256_of(path))
-    write_manifest(folder, make_manifest(config, [entry], {}))
+    write_manifest(folder, make_manifest(config, [entry], {"versions": {}, "broken_backgrounds": []}))
     return open_dataset(folder)
 
 

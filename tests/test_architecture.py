@@ -33,7 +33,8 @@ GROUND = {
     "locks": ["errors", "files"],
     "signals": [],
     "decoding": ["errors", "files"],
-    "hdf5": ["errors", "files", "signals"],
+    "hdf5_structure": [],
+    "hdf5": ["errors", "files", "signals", "hdf5_structure"],
     "pixels": ["errors", "types", "decoding"],
     "films": ["errors", "types", "decoding", "pixels"],
     "images": ["errors", "types", "files", "decoding", "writing", "pixels", "films"],
@@ -64,7 +65,7 @@ ROOMS = {
 LAST = "cli"
 """The room that may import every other one, and that no other may import."""
 TORCH_ROOM = "training"
-H5PY_MODULES = {"hdf5", "dataset.shard", "predictions.table_files"}
+H5PY_MODULES = {"hdf5", "hdf5_structure", "dataset.shard", "predictions.table_files"}
 ONNXRUNTIME_ROOMS = {"detectors", TORCH_ROOM}
 HEAVY = {"torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
 """Packages that neither ``import kpbench`` nor ``kpbench --help`` loads."""

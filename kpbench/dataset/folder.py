@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,7 +17,8 @@ from numpy.typing import NDArray
 
 from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, open_shard, shard_errors
 from kpbench.errors import DataError, system_reason
-from kpbench.files import encode_utf8, folder_at, is_local, load_json, note_read, sha256_of
+from kpbench.files import DoubleKeyError, encode_utf8, folder_at, is_local, load_json, note_read, sha256_of
+from kpbench.hdf5 import MOST_AHEAD
 from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
 from kpbench.writing import write_file
@@ -26,6 +28,8 @@ LARGEST_NUMBER = 2**53
 """Every number of a manifest is smaller; other languages read larger ones inexactly."""
 MOST_OPEN_SHARDS = 128
 """Largest number of shards that a dataset keeps open. Many systems allow a process 256 open files."""
+SHARD_NAME = re.compile(r"shard-\d{5,}\.h5")
+"""Names of the shards that kpbench writes."""
 FINITE_COLUMNS = ("x", "y", "radius_major", "radius_minor", "H_patch2image")
 """Columns of a keypoint that have a finite value in every dataset."""
 
@@ -140,16 +144,23 @@ class Dataset:
         state.pop("truth", None)
         return state
 
-    def _open(self, n: int) -> Shard:
-        """Return the open file of shard n. If too many shards are open, close the least recently used shard."""
+    def _open(self, n: int, in_order: bool = False) -> Shard:
+        """Return the open file of shard n. If too many shards are open, close the least recently used shard.
+
+        ``in_order`` tells that the shards after it are opened next.
+        """
         if self._process != os.getpid():  # after a fork, the open files belong to the parent
             self._files, self._process = {}, os.getpid()
         name = self.shards[n].file
-        file = self._files.pop(name, None) or open_shard(self.path / name)
+        file = self._files.pop(name, None) or open_shard(self.path / name, self._following(n) if in_order else ())
         if len(self._files) == MOST_OPEN_SHARDS:
             self._files.pop(next(iter(self._files))).close()
         self._files[name] = file  # the last file in the dict is the file used last
         return file
+
+    def _following(self, n: int) -> list[Path]:
+        """Return the paths of the shards after shard n."""
+        return [self.path / shard.file for shard in self.shards[n + 1 : n + MOST_AHEAD]]
 
     def _locate(self, index: int) -> tuple[Shard, int, Path]:
         """Return the open file that holds an image, the image's row in the file, and the file's path."""
@@ -184,7 +195,7 @@ class Dataset:
         """Yield whole columns, shard by shard."""
         for n, shard in enumerate(self.shards):
             with shard_errors(self.path / shard.file):
-                columns = [self._open(n)[name] for name in names]
+                columns = [self._open(n, in_order=True)[name] for name in names]
                 yield [data.asstr()[:].astype(str) if data.dtype.kind == "S" else data[:] for data in columns]
 
     @cached_property
@@ -199,13 +210,13 @@ class Dataset:
     def verify(self) -> Iterator[ShardEntry]:
         """Check every field of the manifest and every byte of the shards. Yield each shard after its check.
 
-        The versions and broken backgrounds of ``provenance`` cannot be recomputed; only their types are checked.
+        The versions in ``provenance`` cannot be recomputed; only their types are checked.
 
         Raises
         ------
         DataError
             At the first field that does not fit the shards, or the first shard that is missing, differs in a byte, or
-            cannot be read.
+            cannot be read. If the folder holds a shard that the manifest does not list.
         """
         manifest = self.path / MANIFEST
         expected = {"version": 1, "seed": self.config.get("seed"), "images": len(self)}
@@ -213,22 +224,26 @@ class Dataset:
             if canonical_json(self._manifest.get(name)) != canonical_json(value):
                 found = repr(self._manifest[name])[:60] if name in self._manifest else "missing"
                 raise DataError(f"{manifest}: {name} is {found}, expected {value!r}")
-        for name in sorted(
-            self._manifest.keys() - {*expected, "schema", "fingerprint", "config", "shards", "provenance"}
-        ):
+        known = {*expected, "schema", "fingerprint", "config", "shards", "provenance"}
+        for name in sorted(self._manifest.keys() - known):
             raise DataError(f"{manifest}: unknown key {name[:60]!r}")
-        if not _is_provenance(self.provenance):
-            raise DataError(f"{manifest}: provenance is no object with versions and broken_backgrounds")
+        if fault := _find_provenance_fault(self._manifest.get("provenance"), is_whole=True):
+            raise DataError(f"{manifest}: {fault}")
+        listed = {shard.file for shard in self.shards}
+        found = {path.name for path in self.path.glob("shard-*.h5") if SHARD_NAME.fullmatch(path.name)}
+        for name in sorted(found - listed):
+            raise DataError(f"{manifest}: does not list {name}, which is in its folder")
         if compute_fingerprint(self.config, self.shards) != self.fingerprint:
             raise DataError(f"{manifest}: its fingerprint does not fit its config and shards")
-        image_id = list[NDArray[np.int64]]()
-        for shard in self.shards:
+        image_id, broken_files = list[NDArray[np.int64]](), set[str]()
+        for n, shard in enumerate(self.shards):
             path = self.path / shard.file
             digest = sha256_of(path)
             if digest != shard.sha256:
                 raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
-            with open_shard(path) as file, shard_errors(path):
+            with open_shard(path, self._following(n)) as file, shard_errors(path):
                 count, config = len(file["images"]), file.texts["config"]
+                broken_files.update(load_json(file.texts["broken_backgrounds"]))
                 keypoints = file["keypoints"][:]
                 image_id.append(file["image_id"][:])
             if not all(np.isfinite(keypoints[name]).all() for name in FINITE_COLUMNS):
@@ -240,16 +255,23 @@ class Dataset:
             yield shard
         if len(np.unique(np.concatenate(image_id))) < len(self):
             raise DataError(f"{manifest}: two images of its shards have the same image_id")
+        if self.provenance["broken_backgrounds"] != sorted(broken_files):
+            raise DataError(f"{manifest}: broken_backgrounds are not those of its shards")
 
 
-def _is_provenance(content: object) -> bool:
-    """Return whether the types of a manifest's provenance are right; {} and absent parts are allowed."""
+def _find_provenance_fault(content: object, is_whole: bool) -> str | None:
+    """Return what is wrong with the provenance of a manifest, or None. Unless ``is_whole``, parts may be absent."""
+    expected = "expected an object with versions and broken_backgrounds"
     if not isinstance(content, dict):
-        return False
+        return f"provenance is {'missing' if content is None else 'no object'}, {expected}"
+    if is_whole and content.keys() != {"versions", "broken_backgrounds"}:
+        return f"provenance has {', '.join(sorted(content))[:60] or 'no keys'}, {expected}"
     versions, broken = content.get("versions", {}), content.get("broken_backgrounds", [])
-    if not isinstance(versions, dict) or not isinstance(broken, list):
-        return False
-    return all(isinstance(text, str) for text in [*versions.values(), *broken])
+    if not isinstance(versions, dict) or not all(isinstance(text, str) for text in versions.values()):
+        return "provenance: versions is no object of texts"
+    if not isinstance(broken, list) or not all(isinstance(text, str) for text in broken):
+        return "provenance: broken_backgrounds is no list of texts"
+    return None
 
 
 def open_dataset(path: str | Path) -> Dataset:
@@ -304,6 +326,7 @@ def _read_manifest(folder: Path) -> Dataset:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
         shards = [ShardEntry(**entry) for entry in content["shards"]]
         fault = _find_fault(content["config"], content["fingerprint"], shards)
+        fault = fault or _find_provenance_fault(content.get("provenance", {}), is_whole=False)
     except FileNotFoundError:
         if any(folder.glob("shard-*.h5")):
             raise DataError(f"{folder}: an unfinished dataset (no {MANIFEST}); resume the run that makes it") from None
@@ -312,6 +335,8 @@ def _read_manifest(folder: Path) -> Dataset:
         raise DataError(f"{folder}: a file, expected the folder of a dataset") from None
     except OSError as error:
         raise DataError(f"{manifest}: cannot be read, {system_reason(error) or error}") from None
+    except DoubleKeyError as error:
+        raise DataError(f"{manifest}: {error}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
         expected = "JSON with schema, config, fingerprint and shards"
         raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None
@@ -326,6 +351,9 @@ def _find_fault(config: object, fingerprint: object, shards: Sequence[ShardEntry
         return "config is no object"
     if not isinstance(fingerprint, str):
         return "fingerprint is no text"
+    patches = config.get("patches", [])
+    if not isinstance(patches, list) or not all(map(_is_patch, patches)):
+        return "config: patches is no list of objects with a whole number id and a text name"
     first, files = 0, set[str]()
     for n, shard in enumerate(shards):
         for name, value in vars(shard).items():
@@ -345,3 +373,7 @@ def _find_fault(config: object, fingerprint: object, shards: Sequence[ShardEntry
         first += shard.count
         files.add(shard.file)
     return None
+
+
+def _is_patch(content: object) -> bool:
+    return isinstance(content, dict) and type(content.get("id")) is int and isinstance(content.get("name"), str)

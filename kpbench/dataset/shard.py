@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError, system_reason
 from kpbench.files import encode_utf8
-from kpbench.hdf5 import Column, Layout, open_hdf5
+from kpbench.hdf5 import open_hdf5
+from kpbench.hdf5_structure import Column, Layout
 from kpbench.types import KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
@@ -41,6 +42,7 @@ SHARD_COLUMNS = {
     "background": _TEXT,
 }
 SHARD_TEXTS = ("schema", "config", "broken_backgrounds")
+SHARD_LAYOUT = Layout(SHARD_COLUMNS, SHARD_TEXTS, has_others=True)
 
 
 @dataclass(frozen=True)
@@ -236,8 +238,14 @@ class Shard:
         return pixels.reshape(shape)
 
 
-def open_shard(path: Path) -> Shard:
+def open_shard(path: Path, following: Sequence[Path] = ()) -> Shard:
     """Open a shard. Check that all data lie in the file itself and have a plausible size.
+
+    Parameters
+    ----------
+    path : Path
+    following : sequence of Path
+        Shards that are opened next, in this order. They are checked meanwhile, so that opening them takes less time.
 
     Raises
     ------
@@ -246,7 +254,7 @@ def open_shard(path: Path) -> Shard:
         datasets, or other filters than kpbench writes.
     """
     with shard_errors(path):
-        file, texts = open_hdf5(path, Layout(SHARD_COLUMNS, SHARD_TEXTS, has_others=True))
+        file, texts = open_hdf5(path, SHARD_LAYOUT, following)
         try:
             _check_shard(file, texts)
             return Shard(file, texts)
@@ -267,8 +275,9 @@ def _check_shard(file: Any, texts: Mapping[str, str]) -> None:
         raise ValueError(f"/images has the shape {images.shape}, expected (N,H,W) or (N,H,W,3), a gzip chunk per image")
     for name in SHARD_COLUMNS:
         expected = (count + (name == "offsets"),)
-        if name not in ("images", "keypoints") and file[name].shape != expected:
-            raise ValueError(f"/{name} has shape {file[name].shape}, which does not fit {count} images")
+        found = h5py.h5d.open(file.id, name.encode()).shape  # faster than file[name].shape
+        if name not in ("images", "keypoints") and found != expected:
+            raise ValueError(f"/{name} has shape {found}, which does not fit {count} images")
     offsets = file["offsets"][:]
     if offsets[0] != 0 or offsets[-1] != len(file["keypoints"]) or np.any(np.diff(offsets) < 0):
         raise ValueError("/offsets does not fit /keypoints")

@@ -63,6 +63,8 @@ def read_predictions(path: str | Path) -> Predictions:
     try:
         suffix = _require_known_suffix(path)
         note_read(path)
+        if path.is_fifo():  # would wait for a writer, and could be read only once
+            raise PredictionsError("is no regular file")
         with path.open("rb") as file:  # opened here, so that all formats have one message for a missing file
             if not file.read(1):
                 raise PredictionsError("the file is empty")

@@ -327,7 +327,8 @@ def read_h5(path: Path) -> Predictions:
     PredictionsError
         At the first fault, or if data is stored outside the file.
     """
-    from kpbench.hdf5 import Column, Layout, StructureError, open_hdf5
+    from kpbench.hdf5 import open_hdf5
+    from kpbench.hdf5_structure import Column, Layout, StructureError
 
     columns = {
         name: Column("iu" if kind == "i" else "fiu", H5_FILTERS, (1 + (name == "xy"),), name in ("score", "id"))

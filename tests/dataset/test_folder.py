@@ -38,7 +38,7 @@ def write_dataset(folder, counts=(4, 3), shape=(40, 50)):
         write_file(path, data)
         entries.append(ShardEntry(path.name, first, count, len(data), sha256_of(path)))
         first += count
-    write_manifest(folder, make_manifest(CONFIG, entries, {}))
+    write_manifest(folder, make_manifest(CONFIG, entries, {"versions": {}, "broken_backgrounds": []}))
     return folder
 
 

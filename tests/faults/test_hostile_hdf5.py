@@ -189,11 +189,11 @@ def test_only_one_module_opens_hdf5_files_for_reading():
 def test_a_child_process_that_is_gone_is_started_anew(files):
     path = files["predictions"][0]
     kpbench.read_predictions(path)
-    first = hdf5._child[1]
+    first = hdf5._child.process
     os.kill(first.pid, signal.SIGKILL)
     first.wait()
     assert len(kpbench.read_predictions(path)) == 2
-    assert hdf5._child[1].pid != first.pid
+    assert hdf5._child.process.pid != first.pid
 
 
 def test_a_relative_path_and_a_name_that_is_no_utf8_are_read(here):

@@ -52,10 +52,23 @@ CHANGES = [
     (lambda c: c["config"].update(seed=12), "seed is 0, expected 12"),
     (lambda c: c["config"].update(n=5), "its fingerprint does not fit"),
     (lambda c: c.update(config=[]), "config is no object"),
-    (lambda c: c.update(provenance=[]), "provenance is no object with versions and broken_backgrounds"),
-    (lambda c: c["provenance"].update(versions=3), "provenance is no object"),
-    (lambda c: c["provenance"]["versions"].update(numpy=2.0), "provenance is no object"),
-    (lambda c: c["provenance"].update(broken_backgrounds=[1]), "provenance is no object"),
+    (lambda c: c.update(provenance=[]), "provenance is no object, expected an object with versions and broken_backgr"),
+    (lambda c: c.pop("provenance"), "provenance is missing, expected an object with versions and broken_backgrounds"),
+    (lambda c: c["provenance"].clear(), "provenance has no keys, expected"),
+    (lambda c: c["provenance"].pop("versions"), "provenance has broken_backgrounds, expected"),
+    (lambda c: c["provenance"].pop("broken_backgrounds"), "provenance has versions, expected"),
+    (lambda c: c["provenance"].update(more=1), "provenance has broken_backgrounds, more, versions, expected"),
+    (lambda c: c["provenance"].update(versions=3), "provenance: versions is no object of texts"),
+    (lambda c: c["provenance"]["versions"].update(numpy=2.0), "provenance: versions is no object of texts"),
+    (lambda c: c["provenance"].update(broken_backgrounds=[1]), "provenance: broken_backgrounds is no list of texts"),
+    (lambda c: c["provenance"].update(broken_backgrounds=["a.jpg"]), "broken_backgrounds are not those of its shards"),
+    (lambda c: c["config"].update(patches=3), "config: patches is no list of objects"),
+    (lambda c: c["config"].update(patches=[{"id": "a", "name": "b"}]), "config: patches is no list of objects"),
+    (lambda c: c["config"].update(patches=[{"id": 1, "name": 2}]), "config: patches is no list of objects"),
+    (lambda c: c.pop("schema"), "not a dataset manifest"),
+    (lambda c: c.pop("config"), "not a dataset manifest"),
+    (lambda c: c.pop("shards"), "not a dataset manifest"),
+    (lambda c: c.pop("fingerprint"), "not a dataset manifest"),
     (lambda c: c.update(more=1), "unknown key 'more'"),
     (lambda c: c["shards"].append(c["shards"][1]), "shards[2]: shard-00001.h5 is listed twice"),
     (lambda c: c["shards"].append(c["shards"][0] | {"first": 6}), "shards[2]: shard-00000.h5 is listed twice"),
@@ -111,3 +124,36 @@ def test_the_number_of_a_shard_that_no_memory_holds_is_one_line(tmp_path, name):
     (tmp_path / "dataset.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match=r"dataset\.json: "):
         open_dataset(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["shard-00002.h5", "shard-99999.h5", "shard-123456.h5"])
+def test_a_shard_that_the_manifest_does_not_list_is_named(tmp_path, dataset, name):
+    folder = shutil.copytree(dataset.path, tmp_path / "set")
+    shutil.copy(folder / "shard-00000.h5", folder / name)
+    [line] = kpbench("verify", folder, code=1).stderr.splitlines()
+    assert line.endswith(f"dataset.json: does not list {name}, which is in its folder")
+
+
+def test_files_of_the_user_in_the_folder_are_no_shards(tmp_path, dataset):
+    folder = shutil.copytree(dataset.path, tmp_path / "set")
+    for name in ("shard-notes.h5", "predictions.h5", "notes.txt"):
+        (folder / name).write_bytes(b"mine")
+    assert "2 shards" in kpbench("verify", folder).stdout or list(open_dataset(folder).verify())
+
+
+TWICE = {
+    "manifest": ('"seed": 0,', '"seed": 0, "seed": 0,'),
+    "config": ('"config": {', '"config": {"kind": "synth",'),
+    "shard": ('"first": 0,', '"first": 0, "first": 0,'),
+    "escaped": ('"images": 6,', '"images": 6, "im\\u0061ges": 6,'),
+}
+
+
+@pytest.mark.parametrize("place", TWICE)
+def test_a_key_that_is_there_twice_is_named(tmp_path, dataset, place):
+    folder = shutil.copytree(dataset.path, tmp_path / "set")
+    text = (folder / "dataset.json").read_text()
+    assert TWICE[place][0] in text
+    (folder / "dataset.json").write_text(text.replace(*TWICE[place], 1))
+    with pytest.raises(DataError, match=r"dataset\.json: .*key '(seed|kind|first|images)' is there twice"):
+        open_dataset(folder)
