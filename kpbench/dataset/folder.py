@@ -230,8 +230,8 @@ class Dataset:
         if fault := _find_provenance_fault(self._manifest.get("provenance"), is_whole=True):
             raise DataError(f"{manifest}: {fault}")
         listed = {shard.file for shard in self.shards}
-        found = {path.name for path in self.path.glob("shard-*.h5") if SHARD_NAME.fullmatch(path.name)}
-        for name in sorted(found - listed):
+        present = {path.name for path in self.path.glob("shard-*.h5") if SHARD_NAME.fullmatch(path.name)}
+        for name in sorted(present - listed):
             raise DataError(f"{manifest}: does not list {name}, which is in its folder")
         if compute_fingerprint(self.config, self.shards) != self.fingerprint:
             raise DataError(f"{manifest}: its fingerprint does not fit its config and shards")

@@ -3,109 +3,48 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
-from kpbench.files import note_read, path_below
+from kpbench.files import load_json, note_read, path_below
+from kpbench.predictions.coco_fields import (
+    EXPECTED_IN_COCO,
+    CocoAnnotation,
+    CocoAnnotations,
+    CocoFile,
+    CocoImage,
+    CocoInfo,
+    CocoResult,
+    column,
+    find_outside,
+    points_of,
+    require_possible_images,
+    require_possible_keypoints,
+)
 from kpbench.predictions.decode import (
     convert_records,
     decode_records,
     json_type,
     parse_json,
     pause_gc,
+    require_single_keys,
     require_utf8,
     split_list,
 )
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
-Whole = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
-Category = Annotated[int, msgspec.Meta(ge=1, le=2**15)]
-"""ID of a category: the patch ID plus 1."""
 IMAGES_LOOKED_AT = 20
 """Number of images whose files are compared with the width and height that the annotations state."""
-Point = tuple[float, float, float]
-"""Place x, y in px, and COCO's visibility v; v = 0 means "not labelled"."""
-
-
-class CocoImage(msgspec.Struct, gc=False):
-    """An entry of ``images``. Condition, rung and scene are kpbench's additions."""
-
-    id: Whole
-    file_name: str = ""
-    width: float | None = None
-    height: float | None = None
-    condition: str = ""
-    rung: float | None = None
-    scene_id: Whole | None = None
-
-
-class CocoAnnotation(msgspec.Struct, gc=False):
-    """An entry of ``annotations``: a keypoint with its disc. The fields from ``radius`` on are kpbench's additions."""
-
-    image_id: Whole
-    category_id: Category
-    keypoints: Point
-    radius: float | None = None
-    radius_major: float | None = None
-    radius_minor: float | None = None
-    axis_angle: float = 0.0
-    visible: float = 1.0
-
-
-class CocoInfo(msgspec.Struct):
-    """The ``info`` object. The fingerprint is kpbench's addition."""
-
-    fingerprint: str = ""
-
-
-class CocoAnnotations(msgspec.Struct):
-    """A COCO annotations file."""
-
-    images: list[CocoImage]
-    annotations: list[CocoAnnotation]
-    info: CocoInfo = msgspec.field(default_factory=CocoInfo)
-
-
-class CocoResult(msgspec.Struct, gc=False):
-    """An entry of a results file: a detection."""
-
-    image_id: Whole
-    category_id: Category
-    keypoints: Point
-    score: float
-
-
-EXPECTED_IN_COCO = {
-    "axis_angle": "degrees",
-    "category_id": "a whole number from 1",
-    "condition": "a text",
-    "file_name": "a text",
-    "height": "a number of px",
-    "id": "a whole number of 0 or more",
-    "image_id": "a whole number of 0 or more",
-    "keypoints": "one keypoint [x, y, v] of numbers",
-    "radius": "a number of px",
-    "radius_major": "a number of px",
-    "radius_minor": "a number of px",
-    "rung": "a number",
-    "scene_id": "a whole number of 0 or more",
-    "score": "a finite number",
-    "visible": "a fraction",
-    "width": "a number of px",
-}
-"""The expected value of each field of the records above, in words."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +140,7 @@ def open_coco(path: str | Path) -> CocoDataset:
             truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
             files = tuple(image.file_name for image in content.images)
             _warn_of_orientation(path, content.images[:IMAGES_LOOKED_AT])
+            _warn_of_keypoints_outside(path, content.images, truth)
             del content  # freed before the garbage collector resumes and scans it
         return CocoDataset(path, truth, files)
     except OSError as error:
@@ -234,9 +174,33 @@ def _warn_of_orientation(path: Path, images: Sequence[CocoImage]) -> None:
             return
 
 
+def _warn_of_keypoints_outside(path: Path, images: Sequence[CocoImage], truth: Truth) -> None:
+    """Warn if keypoints lie outside of the width and height that the annotations state."""
+    counts = np.diff(truth.offsets)
+    width, height = (np.array([getattr(i, name) or 0.0 for i in images], float) for name in ("width", "height"))
+    outside = find_outside(np.repeat(width, counts), np.repeat(height, counts), truth.keypoints)
+    if len(outside):
+        k = truth.keypoints[outside[0]]
+        n = int(np.searchsorted(truth.offsets, outside[0], side="right")) - 1
+        warnings.warn(
+            f"{path}: {len(outside)} of {len(truth.keypoints)} keypoints lie outside of the stated width and height of "
+            f"their images, such as ({k['x']:g}, {k['y']:g}) in the image {truth.image_id[n]} of {width[n]:g} x "
+            f"{height[n]:g}",
+            KpbenchWarning,
+            stacklevel=3,
+        )
+
+
 def _decode_annotations(data: bytes) -> CocoAnnotations:
     try:
-        return msgspec.json.decode(data, type=CocoAnnotations)
+        file = msgspec.json.decode(data, type=CocoFile)
+        images = msgspec.json.decode(file.images, type=list[CocoImage])
+        annotations = msgspec.json.decode(file.annotations, type=list[CocoAnnotation])
+        parts = {b"images": bytes(file.images), b"annotations": bytes(file.annotations)}
+        load_json(_cut_lists(data, parts))  # finds a key that is there twice
+        require_single_keys(parts[b"images"], images, CocoImage)
+        require_single_keys(parts[b"annotations"], annotations, CocoAnnotation)
+        return CocoAnnotations(images, annotations, file.info)
     except (ValueError, RecursionError):
         content = parse_json(data, "the file")  # decoded again, to find the place of the fault
     if not isinstance(content, dict):
@@ -253,19 +217,28 @@ def _decode_annotations(data: bytes) -> CocoAnnotations:
     )
 
 
+def _cut_lists(data: bytes, lists: dict[bytes, bytes]) -> bytes:
+    """Return a JSON object with 0 in place of the lists, or the whole object if a list is not where its name is."""
+    spans = list[tuple[int, int]]()
+    for name, content in lists.items():
+        start = data.find(b'"%s"' % name) + len(name) + 2
+        start += len(data[start : start + 100]) - len(data[start : start + 100].lstrip(b" \t\r\n:"))
+        if not data.startswith(content, start):
+            return data
+        spans.append((start, start + len(content)))
+    ends = [0, *chain.from_iterable(sorted(spans)), len(data)]
+    return b"0".join(data[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True))
+
+
 def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
     images, annotations = content.images, content.annotations
     ids = np.array([image.id for image in images], np.int64)
     sorter = np.argsort(ids, kind="stable")
     if np.any(np.diff(ids[sorter]) == 0):
         raise DataError("two images share an id")
-    image_id = _column(annotations, "image_id", np.int64)
+    require_possible_images(images)
+    image_id = column(annotations, "image_id", np.int64)
     keypoints, labelled = _make_keypoints(annotations)
-    for n, found in enumerate(images):
-        if found.rung is not None and not math.isfinite(found.rung):
-            raise DataError(f"images[{n}] (id {found.id}): rung is {found.rung}, expected a finite number")
-        if not found.condition.isprintable():
-            raise DataError(f"images[{n}] (id {found.id}): condition is {found.condition!r}, expected a text")
     place = np.searchsorted(ids, image_id, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != image_id
     if unknown.any():
@@ -288,51 +261,17 @@ def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
 def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Return the keypoints of all annotations, of type KEYPOINT_DTYPE, and whether each is labelled (v over 0)."""
     table = np.zeros(len(annotations), KEYPOINT_DTYPE)
-    points = _points(annotations)
+    points = points_of(annotations)
     table["x"], table["y"] = points[:, 0], points[:, 1]
-    table["patch_id"] = _column(annotations, "category_id", np.int64) - 1
-    for name in ("axis_angle", "visible"):
-        table[name] = _column(annotations, name)
-    radius, major, minor = (_column(annotations, name) for name in ("radius", "radius_major", "radius_minor"))
-    major = np.where(np.isnan(major), radius, major)
-    labelled = points[:, 2] > 0
-    for n in np.flatnonzero(np.isnan(major) & labelled).tolist():
-        if annotations[n].radius is None and annotations[n].radius_major is None:
-            raise DataError(
-                f"annotations[{n}] (image_id {annotations[n].image_id}): has no radius, "
-                "expected radius, or radius_major and radius_minor, in px"
-            )
-    for name in ("axis_angle", "visible"):  # nan stands for a missing value, so the file must not hold it
-        for n in np.flatnonzero(np.isnan(table[name])).tolist():
-            if getattr(annotations[n], name) is not None:
-                raise DataError(f"annotations[{n}] (image_id {annotations[n].image_id}): {name} is no finite number")
-    table["radius_major"], table["radius_minor"] = major, np.where(np.isnan(minor), major, minor)
-    valid = np.isfinite(points).all(axis=1) & np.isfinite(table["radius_major"]) & np.isfinite(table["radius_minor"])
-    valid &= ~np.isinf(table["axis_angle"]) & ~np.isinf(table["visible"])
-    valid &= (table["radius_major"] > 0) & (table["radius_minor"] > 0)
-    valid |= ~labelled & np.isfinite(points[:, 2])
-    if not valid.all():
-        n = int(np.argmin(valid))
-        raise DataError(
-            f"annotations[{n}] (image_id {annotations[n].image_id}): keypoints are {points[n].tolist()} and the radius "
-            f"is {table['radius_major'][n]}, expected finite numbers and a radius over 0"
-        )
-    return table, labelled
-
-
-def _column(entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: type = np.float64) -> NDArray[Any]:
-    """Return a field of all entries. None becomes nan."""
-    values = map(attrgetter(name), entries)
-    try:
-        return np.fromiter(values, kind, len(entries))
-    except TypeError:  # some value is None
-        return np.array([getattr(entry, name) for entry in entries], kind)
-
-
-def _points(entries: Sequence[CocoAnnotation | CocoResult]) -> NDArray[np.float64]:
-    """Return an array with a row (x, y, v) per entry."""
-    points = chain.from_iterable(map(attrgetter("keypoints"), entries))
-    return np.fromiter(points, np.float64, 3 * len(entries)).reshape(-1, 3)
+    table["patch_id"] = column(annotations, "category_id", np.int64) - 1
+    radius, major, minor = (column(annotations, name) for name in ("radius", "radius_major", "radius_minor"))
+    with np.errstate(over="ignore"):  # some columns have 32 bits; a number that they cannot hold is refused as inf
+        for name, missing in (("axis_angle", 0.0), ("visible", 1.0)):
+            table[name] = column(annotations, name, missing=missing)
+        table["radius_major"] = np.where(np.isnan(major), radius, major)
+        table["radius_minor"] = np.where(np.isnan(minor), table["radius_major"], minor)
+    require_possible_keypoints(annotations, points, table)
+    return table, points[:, 2] > 0
 
 
 def decode_coco_results(data: bytes) -> Predictions:
@@ -367,11 +306,11 @@ def decode_coco_results(data: bytes) -> Predictions:
 
 def _to_columns(batch: list[CocoResult]) -> tuple[NDArray[Any], ...]:
     """Return the columns ``image_id, id, score, x, y`` of some results."""
-    points = _points(batch)
+    points = points_of(batch)
     return (
-        _column(batch, "image_id", np.int64),
-        _column(batch, "category_id") - 1,
-        _column(batch, "score"),
+        column(batch, "image_id", np.int64),
+        column(batch, "category_id") - 1,
+        column(batch, "score"),
         points[:, 0],
         points[:, 1],
     )

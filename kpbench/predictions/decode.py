@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import gc
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from operator import attrgetter
 from typing import Any, TypeVar
 
 import msgspec
 
 from kpbench.errors import PredictionsError
-from kpbench.files import escape_surrogates, load_json
+from kpbench.files import DoubleKeyError, escape_surrogates, load_json
 
 PIECE_BYTES = 4 * 2**20
 """Bytes of JSON that are decoded at a time."""
@@ -54,7 +55,7 @@ def split_list(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
     """
     found = re.search(opening.encode(), data)
     start, stop = (found.end(), data.rfind(b"]")) if found else (0, 0)
-    frame = msgspec.json.decode(data[:start] + data[stop:])
+    frame = load_json(data[:start] + data[stop:])
 
     def pieces() -> Iterator[bytes]:
         low, more = start, False
@@ -98,11 +99,56 @@ def decode_records(
     for piece in pieces:
         try:
             batch: list[Record] = decoder.decode(piece)
+            require_single_keys(piece, batch, record)
+        except DoubleKeyError as error:
+            raise PredictionsError(str(error)) from None
         except (ValueError, RecursionError):
             first = start
             batch = convert_records(load_json(piece), record, expected, lambda n: place(first + n))  # noqa: B023
         yield batch
         start += len(batch)
+
+
+def require_single_keys(data: bytes, records: Sequence[Record], record: type[Record]) -> None:
+    """Refuse a JSON list of records in which an object has a key twice. msgspec takes the last one in silence.
+
+    Records with keys that are not fields are compared with the first one. Otherwise, and if they have other keys than
+    the first one, keys are counted in the text and in the records. Only if the counts differ, the text is decoded again
+    into plain objects. Objects within the records may not be looked at.
+
+    Raises
+    ------
+    DoubleKeyError
+    """
+    names, defaults = record.__struct_fields__, record.__struct_defaults__
+    if not record.__struct_config__.forbid_unknown_fields and _has_keys_of_first(data, len(records)):
+        return
+    counts = dict.fromkeys(names, len(records))
+    for name, default in zip(names[len(names) - len(defaults) :], defaults, strict=True):
+        counts[name] -= list(map(attrgetter(name), records)).count(default)
+    if data.count(b":") == sum(counts.values()):
+        return
+    if b"\\" in data or any(data.count(b'"%s"' % name.encode()) != count for name, count in counts.items()):
+        load_json(data)
+
+
+NUMBER_BYTES = b"0123456789+-.eE[], \t\r\n"
+"""What numbers and lists of numbers are written with."""
+
+
+def _has_keys_of_first(data: bytes, count: int) -> bool:
+    """Return whether the objects of a list have the keys of the first one, in its order, each once.
+
+    False may also be returned if they have. Without numbers, such objects are one text that is repeated.
+    """
+    first = data[data.find(b"{") : data.find(b"}") + 1]
+    try:
+        keys = {key.encode().translate(None, NUMBER_BYTES) for key in load_json(first)}
+    except (DoubleKeyError, ValueError):
+        return False
+    bare = first.translate(None, NUMBER_BYTES)
+    is_distinct = len(keys) == first.count(b":") and b"\\" not in first
+    return is_distinct and data.translate(None, NUMBER_BYTES) == bare * count
 
 
 def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> list[Record]:
@@ -148,13 +194,11 @@ def parse_json(data: bytes, place: str) -> Any:
         If the data is not JSON; the message begins with ``place``.
     """
     try:
-        return msgspec.json.decode(data)
-    except (ValueError, RecursionError) as error:
-        problem = str(error)
-    try:
         return load_json(data)
-    except ValueError:
-        raise PredictionsError(f"{place} is cut off or no JSON ({problem})") from None
+    except DoubleKeyError as error:
+        raise PredictionsError(f"{place}: {error}") from None
+    except ValueError as error:
+        raise PredictionsError(f"{place} is cut off or no JSON ({error})") from None
 
 
 def require_utf8(data: bytes) -> None:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from kpbench.errors import PredictionsError
+from kpbench.files import DoubleKeyError
 from kpbench.predictions.coco import decode_coco_results
 from kpbench.predictions.decode import (
     PIECE_BYTES,
@@ -19,6 +20,7 @@ from kpbench.predictions.decode import (
     decode_records,
     json_type,
     parse_json,
+    require_single_keys,
     split_list,
 )
 from kpbench.predictions.fields import EXPECTED_IN_RECORD, SCHEMA, ImageRecord, make_header, parse_header
@@ -77,12 +79,17 @@ def read_jsonl(path: Path) -> Predictions:
     def read_batches(file: BinaryIO) -> Iterator[list[ImageRecord]]:
         first = 2
         while lines := file.readlines(PIECE_BYTES):
-            yield [decode_line(line, n) for n, line in enumerate(lines, first)]
+            batch = [decode_line(line, n) for n, line in enumerate(lines, first)]
+            require_single_keys(b"[%s]" % b",".join(lines), batch, ImageRecord)
+            yield batch
             first += len(lines)
 
     with path.open("rb") as file:
         header = parse_header(parse_json(file.readline(), "line 1"))
-        return _combine(read_batches(file), header, lambda n: f"line {n + 2}")
+        try:
+            return _combine(read_batches(file), header, lambda n: f"line {n + 2}")
+        except DoubleKeyError as error:
+            raise PredictionsError(str(error)) from None
 
 
 class _Batch(NamedTuple):

@@ -24,6 +24,7 @@ def perfect(images=IMAGES, **about):
 def complaint(*args):
     """The one line of an error."""
     lines = kpbench("score", *args, code=1).stderr.splitlines()
+    lines = [line for line in lines if "lie outside of" not in line]  # the images have 8 x 8 px
     assert len(lines) == 1
     return lines[0]
 

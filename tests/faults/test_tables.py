@@ -97,7 +97,7 @@ def coco(folder, annotations, **image):
 @pytest.mark.parametrize("place", [[0, 0, 0], [3, 4, 0]])
 def test_v_0_is_no_keypoint_with_and_without_a_radius(tmp_path, given, place):
     unlabelled = {k: v for k, v in ONE.items() if k != "radius"} | {"keypoints": place} | given
-    truth = open_coco(coco(tmp_path, [unlabelled, ONE, unlabelled])).truth
+    truth = open_coco(coco(tmp_path, [unlabelled | {"id": 5}, ONE, unlabelled | {"id": 6}])).truth
     assert truth.keypoints[["x", "y", "radius_major"]].tolist() == [(3, 4, 2)]
 
 
