@@ -243,7 +243,7 @@ class Dataset:
                 raise DataError(f"{path}: damaged, SHA-256 is {digest[:12]}…, expected {shard.sha256[:12]}…")
             with open_shard(path, self._following(n)) as file, shard_errors(path):
                 count, config = len(file["images"]), file.texts["config"]
-                broken_files.update(load_json(file.texts["broken_backgrounds"]))
+                broken_files.update(map(str, load_json(file.texts["broken_backgrounds"])))
                 keypoints = file["keypoints"][:]
                 image_id.append(file["image_id"][:])
             if not all(np.isfinite(keypoints[name]).all() for name in FINITE_COLUMNS):

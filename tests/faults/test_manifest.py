@@ -3,12 +3,15 @@
 import json
 import shutil
 
+import h5py
+import numpy as np
 import pytest
 from helpers import kpbench
 
 from kpbench import open_dataset
 from kpbench.dataset.folder import compute_fingerprint
 from kpbench.errors import DataError
+from kpbench.files import sha256_of
 
 
 @pytest.fixture
@@ -157,3 +160,18 @@ def test_a_key_that_is_there_twice_is_named(tmp_path, dataset, place):
     (folder / "dataset.json").write_text(text.replace(*TWICE[place], 1))
     with pytest.raises(DataError, match=r"dataset\.json: .*key '(seed|kind|first|images)' is there twice"):
         open_dataset(folder)
+
+
+@pytest.mark.parametrize("text", ['["a", 1]', "[[1], {}]", "5", '"a"', "{", "null"])
+def test_odd_backgrounds_in_a_shard_are_one_line(tmp_path, dataset, text):
+    folder = shutil.copytree(dataset.path, tmp_path / "set")
+    content = json.loads((folder / "dataset.json").read_text())
+    path = folder / content["shards"][0]["file"]
+    with h5py.File(path, "r+") as file:
+        file.attrs["broken_backgrounds"] = np.bytes_(text)
+    content["shards"][0] |= {"bytes": path.stat().st_size, "sha256": sha256_of(path)}
+    shards = [type(dataset.shards[0])(**shard) for shard in content["shards"]]
+    content["fingerprint"] = compute_fingerprint(content["config"], shards)
+    (folder / "dataset.json").write_text(json.dumps(content))
+    [line] = kpbench("verify", folder, code=1).stderr.splitlines()
+    assert "background" in line or "damaged or no kpbench shard" in line

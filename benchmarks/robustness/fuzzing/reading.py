@@ -52,6 +52,7 @@ def read_shard(path: Path) -> Any:
     config, text = next((pair for pair in zip(configs, texts, strict=True) if pair[1].encode() in data), ({}, "{}"))
     mark = hashlib.sha256("\n".join([text, entry["sha256"]]).encode()).hexdigest()
     content = {"schema": "kpbench.dataset/1", "version": 1, "fingerprint": mark, "config": config, "shards": [entry]}
+    content["provenance"] = {"versions": {}, "broken_backgrounds": []}
     content |= {"images": 2, "seed": config.get("seed")}
     (path.parent / "dataset.json").write_text(json.dumps(content))
     return read_dataset(path.parent)
