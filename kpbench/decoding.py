@@ -20,27 +20,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.files import note_read
+from kpbench.memory import require_memory
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MOST_PIXELS = int(os.environ.get("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000"))
+"""Largest number of pixels of an image that OpenCV decodes."""
 MOST_PIXELS_TWICE = 2**25
 """Largest number of pixels of an image that Pillow looks at before OpenCV. Larger images would take much memory."""
+BYTES_PER_PIXEL = 16
+"""Memory per pixel while an image is decoded, bytes."""
 MOST_PIXELS_PER_BYTE = 2_000
 """Largest number of pixels of all frames of an animation, per byte of its file. Films have a few pixels per byte."""
 
 
-def read_bytes(path: Path) -> NDArray[np.uint8] | None:
-    """Return the content of a file; None if the file cannot be read. The name may hold bytes that are no UTF-8."""
-    try:
-        note_read(path)
-        return np.fromfile(path, np.uint8)
-    except (OSError, ValueError):  # a ValueError: no file has such a name
-        return None
+def decode_image(data: NDArray[np.uint8], flags: int) -> NDArray[Any] | None:
+    """Return the image that ``cv2.imdecode`` makes of a file's content; None if the content cannot be decoded.
 
-
-def decode_image(data: NDArray[np.uint8] | None, flags: int) -> NDArray[Any] | None:
-    """Return the image that ``cv2.imdecode`` makes of a file's content; None if the content cannot be decoded."""
-    if data is None or not len(data) or not _is_whole(data):
+    Raises
+    ------
+    DataError
+        If the memory is too small for the image.
+    """
+    if not len(data) or not _is_whole(data):
         return None
     try:
         return cv2.imdecode(data, flags)
@@ -52,8 +53,14 @@ def _is_whole(data: NDArray[np.uint8]) -> bool:
     """Return whether all pixels of an image file lie within the file. OpenCV fills up what is missing."""
     content = data.tobytes()
     if content.startswith(PNG_SIGNATURE):
+        _require_memory(*struct.unpack(">II", content[16:24].ljust(8, b"\0")))
         return is_whole_png(content)
     return _is_whole_for_pillow(content)
+
+
+def _require_memory(width: int, height: int) -> None:
+    if width * height <= MOST_PIXELS:
+        require_memory(width * height * BYTES_PER_PIXEL, f"an image of {width} x {height} pixels")
 
 
 def is_whole_png(content: bytes, first_frame_alone: bool = False) -> bool:
@@ -106,6 +113,7 @@ def _is_whole_for_pillow(content: bytes) -> bool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images, of which OpenCV decides
             with Image.open(io.BytesIO(content)) as image:
+                _require_memory(image.width, image.height)
                 pixels = image.width * image.height
                 if image.format in ("GIF", "JPEG", "JPEG2000", "WEBP") and pixels > MOST_PIXELS_PER_BYTE * len(content):
                     return False
@@ -114,6 +122,8 @@ def _is_whole_for_pillow(content: bytes) -> bool:
                     image.load()
     except OSError as error:
         return not re.search("truncated|broken data stream", str(error))
+    except DataError:
+        raise
     except Exception:  # Pillow's plugins raise errors of many classes for what they do not know
         return True
     return True

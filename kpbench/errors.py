@@ -79,11 +79,17 @@ class GateFailed(KpbenchError):
     """A score misses a limit that the caller set."""
 
 
+class UnreadableFile(OSError):
+    """A path names no regular file, or a file that is too large. The message tells which, without the path."""
+
+
 def system_reason(error: BaseException) -> str | None:
     """Return why the system refused a file, such as "Permission denied"; None if the error is not the system's.
 
     h5py raises OSError both for a damaged file and for a file that the system refuses. Only the latter has a number.
     """
+    if isinstance(error, UnreadableFile):
+        return str(error)
     if not isinstance(error, OSError) or not error.errno:
         return None
     return REASONS.get(error.errno) or os.strerror(error.errno)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
 import json
 import os
 import re
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path, PureWindowsPath
-from typing import Any
+from typing import Any, cast
 from urllib.parse import unquote
 
-from kpbench.errors import DataError, KpbenchError, system_reason
+from kpbench.errors import DataError, KpbenchError, UnreadableFile, system_reason
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
+LARGEST_FILE = 2**31
+"""Largest accepted number of bytes of a file that is read as a whole."""
 LARGEST_TEXT = 2**22
 """Largest accepted number of bytes of a design, a board, a suite, a recipe or a pipeline."""
 
@@ -60,7 +65,7 @@ def protect_read_files() -> Iterator[None]:
 
 
 def note_read(path: str | Path) -> None:
-    """Note that the running command reads a file. Every function that reads a user's file calls ``note_read``."""
+    """Note that the running command reads a file. :func:`open_file` notes every file that it opens."""
     noted = _read.get()
     if noted is not None:
         with suppress(OSError, ValueError):
@@ -74,6 +79,61 @@ def is_read(path: Path) -> bool:
     return (found.st_dev, found.st_ino) in (_read.get() or ())
 
 
+def open_file(path: str | Path, is_noted: bool = True) -> io.BufferedReader:
+    """Open a regular file for reading, and note that it is read. Every file of the user's is opened here.
+
+    ``is_noted`` : False for a file that the running command may replace later.
+
+    A device may have no end, and a pipe may have no beginning. Both are refused, also behind a symbolic link.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened.
+    UnreadableFile
+        If the path names no regular file.
+    """
+    if not is_local(path):
+        return cast(Path, path).open("rb")
+    if is_noted:
+        note_read(path)
+    _require_regular(os.stat(path).st_mode)  # opening some devices does something
+    # without O_NONBLOCK, a pipe that has taken the file's place since then would block
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        _require_regular(os.fstat(descriptor).st_mode)
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return os.fdopen(descriptor, "rb")
+
+
+def _require_regular(mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+    if not stat.S_ISREG(mode):
+        kind = "pipe" if stat.S_ISFIFO(mode) else "socket" if stat.S_ISSOCK(mode) else "device"
+        raise UnreadableFile(f"it is a {kind}, expected a file")
+
+
+def read_bytes(path: str | Path, most: int = LARGEST_FILE, is_noted: bool = True) -> bytes:
+    """Return the content of a regular file.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be read.
+    UnreadableFile
+        If the path names no regular file, or a file of more than ``most`` bytes.
+    """
+    with open_file(path, is_noted) as file:
+        size = os.fstat(file.fileno()).st_size if is_local(path) else 0
+        data = file.read(most + 1) if size <= most else b""
+    if max(size, len(data)) > most:
+        raise UnreadableFile(f"it has more than {most} bytes")
+    return data
+
+
 def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     """Return the text of a UTF-8 file.
 
@@ -82,13 +142,8 @@ def read_text(path: str | Path, error: type[KpbenchError]) -> str:
     error
         If the file cannot be read. The message names the file.
     """
-    note_read(path)
     try:
-        with Path(path).open("rb") as file:
-            data = file.read(LARGEST_TEXT + 1)
-        if len(data) > LARGEST_TEXT:
-            raise error(f"{path}: has more than {LARGEST_TEXT} bytes, too many for such a file")
-        return data.decode()
+        return read_bytes(path, LARGEST_TEXT).decode()
     except OSError as problem:
         raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
     except UnicodeDecodeError:
@@ -147,9 +202,8 @@ def require_readable(path: Path, error: type[KpbenchError] = DataError) -> None:
     error
         If the file cannot be opened. The message names the file and the reason.
     """
-    note_read(path)
     try:
-        path.open("rb").close()
+        open_file(path).close()
     except OSError as problem:
         raise error(f"{path}: cannot be read, {system_reason(problem) or problem}") from None
 
@@ -163,7 +217,7 @@ def sha256_of(path: Path) -> str:
         If the file cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path, is_noted=False) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None

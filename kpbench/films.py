@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kpbench.decoding import MOST_PIXELS_PER_BYTE, is_whole_png, require_opencv_name
 from kpbench.errors import DataError, KpbenchWarning
-from kpbench.pixels import lay_on_white, png_chunk
+from kpbench.pixels import TRANSPARENT, Notes, lay_on_white, png_chunk
 from kpbench.types import UInt8
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
@@ -154,10 +154,11 @@ def _video_frames(
         yield from [None] * missing
 
 
-def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
+def open_animation(path: Path, data: NDArray[np.uint8], notes: Notes | None = None) -> Film | None:
     """Open a GIF, an APNG or a WebP with more than one frame; None if the file is none.
 
     Each frame is drawn over the earlier ones. After a frame that cannot be read, no later frame can be read.
+    ``notes`` : warns of transparency that was removed; None warns of nothing.
     """
     head = data[:21].tobytes()
     is_gif = head[:6] in (b"GIF87a", b"GIF89a")
@@ -165,13 +166,8 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
     is_apng = bool(png_chunk(data, b"acTL"))
     if not (is_gif or is_webp or is_apng) or (is_apng and not is_whole_png(data.tobytes(), first_frame_alone=True)):
         return None
-    from PIL import Image
-
     try:
-        image = Image.open(io.BytesIO(data.tobytes()))
-        length = getattr(image, "n_frames", 1)
-        if is_webp:
-            image.load()  # which reads the duration
+        image, length = _open_frames(data.tobytes(), is_webp)
     except Exception:  # damaged in a way that Pillow has an error of its own for; OpenCV may read the first frame
         return None
     if length < 2:
@@ -193,10 +189,40 @@ def open_animation(path: Path, data: NDArray[np.uint8]) -> Film | None:
             except Exception:
                 yield from [None] * (length - n)
                 return
-            yield lay_on_white(pixels)
+            is_transparent = bool(pixels[..., 3].min() < 255)
+            if is_transparent and notes is not None:
+                notes.warn(path, TRANSPARENT)
+            yield lay_on_white(pixels) if is_transparent else np.ascontiguousarray(pixels[..., :3])
 
     duration_ms = image.info.get("duration") or 1000 / DEFAULT_FPS
     return Film(frames(), length, 1000 / duration_ms)
+
+
+def _open_frames(content: bytes, is_webp: bool) -> tuple[Any, int]:
+    """Return an animation as Pillow opens it, and the number of its frames. A frame that is cut off counts as one."""
+    from PIL import Image
+
+    content, lost = _keep_whole_frames(content) if is_webp else (content, 0)
+    image = Image.open(io.BytesIO(content))
+    if is_webp:
+        image.load()  # which reads the duration
+    try:
+        return image, getattr(image, "n_frames", 1) + lost
+    except Exception:  # a GIF that ends within the head of a frame
+        return Image.open(io.BytesIO(content)), image.tell() + 2
+
+
+def _keep_whole_frames(content: bytes) -> tuple[bytes, int]:
+    """Return a WebP without the chunk in which it is cut off, and the number (0 or 1) of frames that this takes."""
+    at = 12
+    while at + 8 <= len(content):
+        stop = at + 8 + int.from_bytes(content[at + 4 : at + 8], "little")
+        if stop > len(content):
+            break
+        at = stop + stop % 2
+    if at >= len(content):
+        return content, 0
+    return content[:4] + (at - 8).to_bytes(4, "little") + content[8:at], 1
 
 
 def name_frames(numbers: Iterable[int], length: int | None = None) -> str:

@@ -20,9 +20,9 @@ import numpy as np
 
 from kpbench.decoding import require_opencv_name
 from kpbench.errors import DataError, system_reason
-from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, note_read, require_readable
+from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, read_bytes, require_readable
 from kpbench.films import DEFAULT_FPS, VIDEO_SUFFIXES, Film, name_frames, open_animation, open_camera, open_video
-from kpbench.pixels import Notes, decode_pixels
+from kpbench.pixels import Notes, decode_pixels, has_more_pages
 from kpbench.types import UInt8
 from kpbench.writing import move_file, require_writable, write_file
 
@@ -143,17 +143,21 @@ def _read_folder(folder: Path, names: Sequence[str], problems: dict[str, str]) -
 
 def _read_image(path: Path, notes: Notes | None) -> UInt8 | Film | str:
     """Return the pixels of an image file, or the film that it is, or why it cannot be read."""
-    note_read(path)
     try:
-        data = np.fromfile(path, np.uint8)
+        data = np.frombuffer(read_bytes(path), np.uint8)
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):  # no later file could be read either
             raise DataError(f"{path}: cannot be read, {system_reason(error)}") from None
         return f"cannot be read, {system_reason(error) or error}"
-    film = open_animation(path, data)
+    film = open_animation(path, data, notes)
     if film is not None:
         return film
-    image = decode_pixels(data, 3, rotate=True, name=path, notes=notes)
+    try:
+        image = decode_pixels(data, 3, rotate=True, name=path, notes=notes)
+    except DataError as error:  # of the memory
+        return str(error)
+    if image is not None and notes is not None and has_more_pages(data):
+        notes.warn(path, "has several pages, of which only the first is read")
     return UNDECODABLE if image is None else image
 
 
@@ -341,7 +345,7 @@ def decode_photo(path: Path, channels: int) -> UInt8 | None:
     Return None if the file cannot be decoded, or the image has a side under 8 px.
     """
     try:
-        image = decode_pixels(np.fromfile(path, np.uint8), channels, rotate=False)
+        image = decode_pixels(np.frombuffer(read_bytes(path), np.uint8), channels, rotate=False)
     except OSError as error:
         if error.errno in (errno.EMFILE, errno.ENFILE):
             raise DataError(f"{path}: cannot be read, {system_reason(error)}") from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +18,26 @@ from numpy.typing import NDArray
 
 from kpbench.decoding import decode_image
 from kpbench.errors import KpbenchWarning
+from kpbench.files import open_file
 from kpbench.types import UInt8
 
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits per sample of cameras that store 16-bit pictures."""
 _PNG_SIGNATURE, _JPEG_SIGNATURE, _TIFF_SIGNATURES = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", (b"II*\0", b"MM\0*")
-_ORIENTATION, _MAX_SAMPLE_VALUE, _EXTRA_SAMPLES = 274, 281, 338
-"""TIFF tags: how the camera was held; the largest value of the samples; what further channels are (1, 2: opacity)."""
+_SUBFILE_TYPE, _ORIENTATION, _MAX_SAMPLE_VALUE, _EXTRA_SAMPLES = 254, 274, 281, 338
+"""TIFF tags: what a page is (bit 0: a small copy, bit 2: a mask); how the camera was held; the largest value of the
+samples; what further channels are (1, 2: opacity)."""
+BAND_PIXELS = 2**17
+"""Number of pixels that are laid on white at once."""
 _PNG_GREY_ALPHA, _PNG_RGBA = 4, 6
 """Colour types of PNG (ISO 15948, 11.2.2)."""
 
 
 SIDEWAYS = (5, 6, 7, 8)
 """Orientations of EXIF in which the width of the stored pixels is the height of the picture."""
+
+
+TRANSPARENT = "is transparent, and is laid on white"
 
 
 class Notes:
@@ -87,9 +95,14 @@ def lay_on_white(image: UInt8, is_multiplied: bool = False) -> UInt8:
 
     ``is_multiplied`` : whether the colours are multiplied by the opacity already, as libtiff gives them.
     """
-    opacity = image[..., 3:].astype(np.uint32)
-    ink = 255 * image[..., :3].astype(np.uint32) if is_multiplied else image[..., :3] * opacity
-    return np.asarray(np.minimum((ink + 255 * (255 - opacity) + 127) // 255, 255), np.uint8)
+    result = np.empty((*image.shape[:2], 3), np.uint8)
+    step = max(1, BAND_PIXELS // max(1, image.shape[1]))
+    for row in range(0, len(image), step):  # in bands of rows, as a pixel takes 50 bytes here
+        band = image[row : row + step]
+        opacity = band[..., 3:].astype(np.uint32)
+        ink = 255 * band[..., :3].astype(np.uint32) if is_multiplied else band[..., :3] * opacity
+        result[row : row + step] = np.minimum((ink + 255 * (255 - opacity) + 127) // 255, 255)
+    return result
 
 
 def bits_used(largest: int, declared: int | None = None) -> int:
@@ -148,7 +161,7 @@ def _decode_deep_or_transparent(
         image = np.dstack([image] * 3)
     if is_transparent:
         if notes is not None:
-            notes.warn(name, "is transparent, and is laid on white")
+            notes.warn(name, TRANSPARENT)
         image = lay_on_white(image, is_multiplied=bits == 8 and _is_tiff(data))
     return _rotate(image[..., :3], data) if rotate else np.ascontiguousarray(image[..., :3])
 
@@ -173,18 +186,36 @@ def _is_tiff(data: NDArray[np.uint8]) -> bool:
 
 def _tiff_tag(data: NDArray[np.uint8], tag: int) -> tuple[int, ...]:
     """Return the numbers of a tag of a TIFF; () if there are none."""
-    if not _is_tiff(data):
+    try:
+        return tuple(int(value) for value in np.ravel(next(_tiff_pages(data)).get(tag, ())))
+    except Exception:  # no TIFF, or any damage: OpenCV has decoded the pixels, so only a hint is lost
         return ()
+
+
+def _tiff_pages(data: NDArray[np.uint8]) -> Iterator[Any]:
+    """Yield the directory of each page of a TIFF."""
+    if not _is_tiff(data):
+        return
     from PIL import TiffImagePlugin
 
-    try:
-        file = io.BytesIO(data.tobytes())
-        directory = TiffImagePlugin.ImageFileDirectory_v2(file.read(8))
-        file.seek(directory.next)
+    content = data.tobytes()
+    at = TiffImagePlugin.ImageFileDirectory_v2(content[:8]).next
+    while at:
+        file, directory = io.BytesIO(content), TiffImagePlugin.ImageFileDirectory_v2(content[:8])
+        file.seek(at)
         directory.load(file)
-        return tuple(int(value) for value in np.ravel(directory.get(tag, ())))
-    except Exception:  # any damage: OpenCV has decoded the pixels, so only a hint is lost
-        return ()
+        at = directory.next
+        yield directory
+
+
+def has_more_pages(data: NDArray[np.uint8]) -> bool:
+    """Return whether a TIFF has a second page that is neither a small copy of the first nor a mask."""
+    try:
+        pages = _tiff_pages(data)
+        next(pages)
+        return not int(next(pages).get(_SUBFILE_TYPE, 0)) & 5
+    except Exception:  # any damage, or no second page
+        return False
 
 
 def png_chunk(data: NDArray[np.uint8], name: bytes) -> bytes:
@@ -226,7 +257,8 @@ def _size_and_orientation(file: Path | io.BytesIO) -> tuple[tuple[int, int], int
 
     size = (0, 0)
     try:
-        with Image.open(file) as image:
+        opened = open_file(file) if isinstance(file, Path) else file
+        with opened, Image.open(opened) as image:
             size = image.size
             return size, int(image.getexif().get(_ORIENTATION, 1))
     except Exception:  # Pillow raises errors of many types

@@ -21,7 +21,7 @@ from kpbench.detectors.inference import open_session, runs_on_gpu
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
 from kpbench.errors import DataError, system_reason
-from kpbench.files import load_json, note_read
+from kpbench.files import load_json, read_bytes
 from kpbench.images import resize, to_grey
 from kpbench.patches.design import parse_patch
 from kpbench.toml import TomlTable, name_source
@@ -254,8 +254,7 @@ class SuperPointDetector:
         ours = WEIGHTS / f"{self.shipped}{'' if runs_on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
-            note_read(self.path)
-            self._session, text = open_session(self.path.read_bytes(), self.threads)
+            self._session, text = open_session(read_bytes(self.path), self.threads)
             content = load_json(text or "{}")
         except DataError:
             raise

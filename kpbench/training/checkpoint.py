@@ -17,16 +17,16 @@ from torch import Tensor
 
 from kpbench import __version__
 from kpbench.errors import DataError, system_reason
+from kpbench.files import open_file
 from kpbench.patches.design import PATCH_KEYS, Patch
 from kpbench.toml import TomlTable, name_source
 from kpbench.training.network import SuperPoint
-from kpbench.training.recipe import Recipe, parse_recipe
+from kpbench.training.recipe import NetworkConfig, Recipe, parse_recipe
 from kpbench.writing import write_file
 
 SCHEMA = "kpbench.checkpoint/1"
 CONTENT_KEYS = ("schema", "recipe", "step", "seconds", "patches", "designs", "versions")
 """Keys of the metadata of a checkpoint."""
-"""Schema of the metadata in a checkpoint."""
 
 
 @dataclass
@@ -126,6 +126,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     from safetensors import SafetensorError, safe_open
 
     try:
+        open_file(path).close()  # refuses what is no file; the library would wait or end the process
         with safe_open(path, framework="pt") as file:
             content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
@@ -141,8 +142,30 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
         table.text("designs")
         table.tables("patches", PATCH_KEYS)
         table.table("versions", ("kpbench", "torch"))
-        load_mean_network(content, tensors)
+        _require_fitting_tensors(content, tensors)
     return content, tensors
+
+
+def empty_network(config: NetworkConfig) -> SuperPoint:
+    """Return a network whose tensors have shapes, but no memory: a file may declare any sizes."""
+    with torch.device("meta"):
+        return SuperPoint(config)
+
+
+def _require_fitting_tensors(content: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> None:
+    """Refuse tensors whose names or shapes are not those of the network that the recipe declares."""
+    network = empty_network(parse_recipe(content.get("recipe", {}), "recipe").network)
+    shapes = {name: tuple(value.shape) for name, value in network.state_dict().items()}
+    needed = {f"{part}.{name}": shape for part in ("network", "mean") for name, shape in shapes.items()}
+    optional = {f"optimizer.{key}.{n}": shapes[n] for key in ("exp_avg", "exp_avg_sq") for n in shapes}
+    optional |= {f"optimizer.step.{n}": () for n in shapes}
+    for name in sorted({*needed, *tensors}):
+        expected = needed.get(name, optional.get(name))
+        theirs = tuple(tensors[name].shape) if name in tensors else None
+        if theirs != expected:
+            given = "missing" if theirs is None else f"of shape {theirs}"
+            wanted = "no such tensor" if expected is None else f"shape {expected}"
+            raise DataError(f"the tensors do not fit the recipe: {name} is {given}, expected {wanted}")
 
 
 def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) -> None:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from kpbench.detectors.inference import import_onnxruntime, open_session
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
-from kpbench.errors import DataError
-from kpbench.files import note_read
+from kpbench.errors import DataError, system_reason
+from kpbench.files import read_bytes
 from kpbench.images import resize
 from kpbench.patches.design import parse_patch
 from kpbench.training.batches import SampleConfig, load_photos, make_batch
@@ -55,12 +55,11 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
 
     require_onnx_target(out)
     try:
-        note_read(model)
-        data = Path(model).read_bytes()
+        data = read_bytes(model)
         given = onnx.load_from_string(data)
         content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
     except Exception as error:  # protobuf raises errors of private classes
-        why = (str(error) or type(error).__name__).splitlines()[0][:200]
+        why = system_reason(error) or (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{model}: cannot be read as an ONNX file of kpbench export-model ({why})") from None
     if content.get("schema") != SCHEMA or "int8" in content:
         raise DataError(f"{model}: expected a float32 network of kpbench export-model")

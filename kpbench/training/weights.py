@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from kpbench.detectors.verification import WEIGHTS
 from kpbench.errors import DataError, system_reason
+from kpbench.files import open_file, read_bytes
 from kpbench.patches.design import Patch
 from kpbench.training.batches import load_photos, make_batch
-from kpbench.training.checkpoint import TrainingState, digest_designs, read_checkpoint, start_state
+from kpbench.training.checkpoint import TrainingState, digest_designs, empty_network, read_checkpoint, start_state
 from kpbench.training.network import SuperPoint, network_input
 from kpbench.training.recipe import NetworkConfig, parse_recipe
 
@@ -63,6 +64,8 @@ def load_initial_weights(
     weights, sizes = read_initial_weights(init, patches)
     their_config = replace(sizes or recipe.network, ids=recipe.network.ids)
     same_sizes = their_config == recipe.network
+    if not same_sizes:  # before memory is taken for the sizes that the file declares
+        _require_fitting(empty_network(their_config).state_dict(), weights, str(init))
     theirs = network if same_sizes else start_state(replace(recipe, network=their_config), device).network
     line = load_into_network(theirs, weights, str(init))
     if is_folded(weights) or not same_sizes:
@@ -120,12 +123,13 @@ def read_weights(path: str | Path) -> dict[str, Tensor]:
     DataError
         If the file cannot be read, or is no dict of named tensors.
     """
-    from safetensors.torch import load_file
+    from safetensors.torch import load
 
     try:
         if Path(path).suffix == ".safetensors":
-            return dict(load_file(path))
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
+            return dict(load(read_bytes(path)))
+        with open_file(path) as file:
+            loaded = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # PyTorch's unpickler raises anything on a damaged file
         why = system_reason(error) or "neither safetensors nor PyTorch's own"
         raise DataError(f"{path}: cannot be read as weights ({why})") from None
@@ -141,14 +145,14 @@ def _read_exported(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     import onnx
 
     try:
-        model = onnx.load(path)
+        model = onnx.load_from_string(read_bytes(path))
         content = json.loads({p.key: p.value for p in model.metadata_props}.get("kpbench", "{}"))
         weights = {t.name: torch.from_numpy(onnx.numpy_helper.to_array(t).copy()) for t in model.graph.initializer}
         if not isinstance(content, dict):
             raise ValueError("its metadata are no JSON object")
         recipe = parse_recipe(content["recipe"], str(path)) if "recipe" in content else None
     except Exception as error:  # protobuf raises errors of private classes
-        why = (str(error) or type(error).__name__).splitlines()[0][:200]
+        why = system_reason(error) or (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{path}: cannot be read as an ONNX model ({why})") from None
     if "int8" in content:
         raise DataError(f"{path}: holds 8-bit integers; start from the float32 file that it was made of")
@@ -180,7 +184,15 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
         If a tensor has a name that the network does not know, if a tensor has a wrong shape, or if a tensor outside the
         attached layers is missing.
     """
-    own = network.state_dict()
+    given, fresh = _require_fitting(network.state_dict(), weights, source)
+    network.load_state_dict({name: weights[name] for name in given}, strict=False)
+    return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
+
+
+def _require_fitting(
+    own: Mapping[str, Tensor], weights: Mapping[str, Tensor], source: str
+) -> tuple[set[str], list[str]]:
+    """Return the names of the tensors to load, and the names of the layers that keep their random weights."""
     bare = is_folded(weights)
     # BatchNorm counts its batches; this count is no weight, and some files lack the count
     ours = {name for name in own if not (name.endswith("num_batches_tracked") or (bare and ".bn." in name))}
@@ -194,9 +206,7 @@ def load_into_network(network: SuperPoint, weights: Mapping[str, Tensor], source
         if own[name].shape != weights[name].shape:
             theirs, expected = tuple(weights[name].shape), tuple(own[name].shape)
             raise DataError(f"{source}: {name} has shape {theirs}, expected {expected}")
-    network.load_state_dict({name: weights[name] for name in given}, strict=False)
-    fresh = sorted({name.split(".")[0] for name in ours - given})
-    return f"{source}: {len(given)} tensors matched; not in it: {', '.join(fresh) or 'nothing'}"
+    return given, sorted({name.split(".")[0] for name in ours - given})
 
 
 def is_folded(weights: Mapping[str, Tensor]) -> bool:

@@ -129,7 +129,7 @@ TOML = {
     "deep value": (DESIGN % ("[" * 150 + "]" * 150), "semicircles[0] is [[["),
     "long number": ('name = "a"\nid = ' + "9" * 5000, "not valid TOML (Exceeds the limit (4300 digits)"),
     "large number": ('name = "a"\nid = 1\nsemicircles = []\nquiet_zone = ' + "9" * 400, "quiet_zone is 9999"),
-    "large file": ("#" * 2**22 + "#", "has more than 4194304 bytes"),
+    "large file": ("#" * 2**22 + "#", "cannot be read, it has more than 4194304 bytes"),
 }
 
 

@@ -170,4 +170,5 @@ def test_an_animated_image_keeps_its_transparency_on_white(tmp_path):
     stream = io.BytesIO()
     frames[0].save(stream, "PNG", save_all=True, append_images=frames[1:], blend=0)
     (tmp_path / "film.png").write_bytes(stream.getvalue())
-    assert [frame[0, 0, 0] for _, frame in open_images(str(tmp_path / "film.png")).images] == [30, 255]
+    with pytest.warns(KpbenchWarning, match=r"film\.png: is transparent, and is laid on white"):
+        assert [frame[0, 0, 0] for _, frame in open_images(str(tmp_path / "film.png")).images] == [30, 255]

@@ -110,21 +110,17 @@ def test_a_refusal_of_the_system_is_named_with_the_path(files, name, number, rea
     path = files / name
     READERS[name](path)
 
-    def refuse(opened, *more, **named):
-        if str(opened) == str(path):
-            raise OSError(number, os.strerror(number), str(opened))
-        return original(opened, *more, **named)
+    def refuse(original):
+        def opener(opened, *more, **named):
+            if str(opened) == str(path):
+                raise OSError(number, os.strerror(number), str(opened))
+            return original(opened, *more, **named)
 
-    for module, attribute in ((io, "open"), (h5py, "File"), (np, "fromfile")):
-        original = getattr(module, attribute)
-        if module is h5py and not name.endswith("h5"):
-            continue
-        if module is np and name != "a.png":
-            continue
-        if module is io and name in ("a.png", "set/shard-00000.h5"):
-            continue
-        monkeypatch.setattr(module, attribute, refuse)
-        break
+        return opener
+
+    for module, attribute in ((io, "open"), (os, "open"), (h5py, "File")):
+        if (module is h5py) == name.endswith("h5"):
+            monkeypatch.setattr(module, attribute, refuse(getattr(module, attribute)))
     with pytest.raises(KpbenchError) as error:
         READERS[name](path)
     assert str(error.value) == f"{path}: cannot be read, {reason}"
@@ -133,14 +129,14 @@ def test_a_refusal_of_the_system_is_named_with_the_path(files, name, number, rea
 def test_an_unreadable_image_of_a_folder_is_named_and_the_others_go_on(here, monkeypatch):
     for name in ("a.png", "b.png", "c.png"):
         cv2.imwrite(name, np.full((48, 64), 90, np.uint8))
-    read = np.fromfile
+    original = os.open
 
     def refuse(path, *more):
-        if path.name == "b.png":
+        if str(path).endswith("b.png"):
             raise PermissionError(13, "Permission denied", str(path))
-        return read(path, *more)
+        return original(path, *more)
 
-    monkeypatch.setattr(np, "fromfile", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     done = kpbench("detect", here, "--detector", "orb", code=1)
     assert "kpbench: b.png: cannot be read, Permission denied" in done.stderr.splitlines()
     assert "in 3 images" in done.stdout

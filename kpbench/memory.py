@@ -1,0 +1,40 @@
+"""Memory: refuse work that the memory of this machine cannot hold, before it begins."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+
+from kpbench.errors import DataError
+
+LEAST_BYTES = 2**28
+"""Work that needs less memory than this is not checked."""
+_CGROUP = Path("/sys/fs/cgroup")
+
+
+def free_bytes() -> int | None:
+    """Return the memory that is free on this machine, or in this container; None if the system does not tell."""
+    found = []
+    with suppress(OSError, ValueError, IndexError):
+        text = Path("/proc/meminfo").read_text()
+        found.append(int(text.split("MemAvailable:")[1].split()[0]) * 1024)
+    with suppress(OSError, ValueError, IndexError):  # the limit is "max" where there is none
+        limit = int((_CGROUP / "memory.max").read_text())
+        cache = (_CGROUP / "memory.stat").read_text().split("inactive_file ")[1].split()[0]
+        found.append(limit - int((_CGROUP / "memory.current").read_text()) + int(cache))
+    return min(found, default=None)
+
+
+def require_memory(needed_bytes: int, what: str) -> None:
+    """Raise an error if the free memory is less than needed.
+
+    Raises
+    ------
+    DataError
+        The message begins with ``what``.
+    """
+    free = free_bytes() if needed_bytes > LEAST_BYTES else None
+    if free is not None and free < needed_bytes:
+        raise DataError(
+            f"{what} needs about {needed_bytes / 2**30:.1f} GiB of memory, {max(free, 0) / 2**30:.1f} GiB are free"
+        )
