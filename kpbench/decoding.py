@@ -27,7 +27,7 @@ MOST_PIXELS = int(os.environ.get("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000"))
 """Largest number of pixels of an image that OpenCV decodes."""
 MOST_PIXELS_TWICE = 2**25
 """Largest number of pixels of an image that Pillow looks at before OpenCV. Larger images would take much memory."""
-BYTES_PER_PIXEL = 16
+DECODING_BYTES_PER_PIXEL = 16
 """Memory per pixel while an image is decoded, bytes."""
 MOST_PIXELS_PER_BYTE = 2_000
 """Largest number of pixels of all frames of an animation, per byte of its file. Films have a few pixels per byte."""
@@ -60,7 +60,7 @@ def _is_whole(data: NDArray[np.uint8]) -> bool:
 
 def _require_memory(width: int, height: int) -> None:
     if width * height <= MOST_PIXELS:
-        require_memory(width * height * BYTES_PER_PIXEL, f"an image of {width} x {height} pixels")
+        require_memory(width * height * DECODING_BYTES_PER_PIXEL, f"an image of {width} x {height} pixels")
 
 
 def is_whole_png(content: bytes, first_frame_alone: bool = False) -> bool:

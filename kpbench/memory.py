@@ -1,7 +1,8 @@
-"""Memory: refuse work that the memory of this machine cannot hold, before it begins."""
+"""Memory: refuse work that this machine cannot hold before it begins, and limit what a child process takes."""
 
 from __future__ import annotations
 
+import signal
 from contextlib import suppress
 from pathlib import Path
 
@@ -38,3 +39,15 @@ def require_memory(needed_bytes: int, what: str) -> None:
         raise DataError(
             f"{what} needs about {needed_bytes / 2**30:.1f} GiB of memory, {max(free, 0) / 2**30:.1f} GiB are free"
         )
+
+
+def limit_process(more_bytes: int, seconds: float) -> None:
+    """Limit the memory that this process may take from now on, and its processor time. A child process calls this."""
+    with suppress(ImportError, OSError, ValueError):  # not on every system
+        import resource
+
+        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (taken + more_bytes, resource.RLIM_INFINITY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if hasattr(signal, "setitimer"):  # not on Windows
+        signal.setitimer(signal.ITIMER_PROF, seconds)

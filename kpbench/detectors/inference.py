@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import os
+import threading
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Protocol
 
 import cv2
@@ -15,6 +17,10 @@ from kpbench.types import Float32
 
 RUNTIMES = ("auto", "cpu", "cuda", "openvino")
 """Values of the environment variable ``KPBENCH_RUNTIME``, see :func:`open_session`."""
+
+
+TRIAL_PX, TRIAL_BYTES, TRIAL_SECONDS = 256, 2**29, 10.0
+"""A network of the user's is tried on an image of this side, px, within this memory, bytes, and this time, s."""
 
 
 class InferenceSession(Protocol):
@@ -63,6 +69,55 @@ def _requested_runtime() -> str:
     if runtime not in RUNTIMES:
         raise DataError(f"KPBENCH_RUNTIME is {runtime!r}, expected one of: {', '.join(RUNTIMES)}")
     return runtime
+
+
+@cache
+def _limit_allocator() -> None:
+    """Make an allocator of at most ``TRIAL_BYTES``. Only sessions that ask for it use it."""
+    onnxruntime = import_onnxruntime()
+    kind, memory = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
+    place = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, memory)
+    onnxruntime.create_and_register_allocator(place, onnxruntime.OrtArenaCfg(TRIAL_BYTES, -1, -1, -1))
+
+
+def try_network(model: bytes, name: str) -> None:
+    """Run a network of unknown origin once on a small image, within limits. A small file may declare any work.
+
+    ``name`` : name of the file, for the message.
+
+    Raises
+    ------
+    DataError
+        If the network needs more memory or time than the limits, or cannot be run.
+    Exception
+        ONNX Runtime's own, if the file is no network.
+    """
+    onnxruntime = import_onnxruntime()
+    _limit_allocator()
+    options, run = onnxruntime.SessionOptions(), onnxruntime.RunOptions()
+    options.intra_op_num_threads, options.log_severity_level, run.log_severity_level = 1, 4, 4
+    options.add_session_config_entry("session.use_env_allocators", "1")
+    loaded, problem = list[Any](), list[Exception]()
+
+    def try_once() -> None:
+        try:
+            loaded.append(onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"]))
+            loaded[0].run(None, {"image": np.zeros((1, 1, TRIAL_PX, TRIAL_PX), np.float32)}, run)
+        except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
+            problem.append(error)
+
+    thread = threading.Thread(target=try_once, daemon=True)
+    thread.start()
+    thread.join(TRIAL_SECONDS)
+    is_slow, run.terminate = thread.is_alive(), True
+    if problem and not loaded:
+        raise problem[0]
+    if is_slow or problem:
+        reason = "it takes longer" if is_slow else str(problem[0]).splitlines()[0][:200]
+        raise DataError(
+            f"{name}: cannot be run on {TRIAL_PX} x {TRIAL_PX} pixels within {TRIAL_BYTES >> 20} MiB and "
+            f"{TRIAL_SECONDS:g} s ({reason})"
+        )
 
 
 def open_session(model: bytes, threads: int = 0) -> tuple[InferenceSession, str]:

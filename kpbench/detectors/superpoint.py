@@ -17,12 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.detectors.inference import open_session, runs_on_gpu
+from kpbench.detectors.inference import open_session, runs_on_gpu, try_network
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
 from kpbench.errors import DataError, system_reason
 from kpbench.files import load_json, read_bytes
 from kpbench.images import resize, to_grey
+from kpbench.memory import require_memory
 from kpbench.patches.design import parse_patch
 from kpbench.toml import TomlTable, name_source
 from kpbench.types import Detections, Float, Float32, UInt8
@@ -254,7 +255,10 @@ class SuperPointDetector:
         ours = WEIGHTS / f"{self.shipped}{'' if runs_on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
         try:
-            self._session, text = open_session(read_bytes(self.path), self.threads)
+            model = read_bytes(self.path)
+            if self.path != ours:
+                try_network(model, str(self.path))
+            self._session, text = open_session(model, self.threads)
             content = load_json(text or "{}")
         except DataError:
             raise
@@ -281,6 +285,16 @@ class SuperPointDetector:
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     @property
+    def _bytes_per_pixel(self) -> float:
+        """Memory that the network needs per pixel of an image, bytes. The factors are measured."""
+        try:
+            channels = min(max(1, int(self.content["recipe"]["network"]["widths"][0])), 4096)
+        except (LookupError, TypeError, ValueError):  # nobody checks this part of the metadata
+            channels = 64
+        scale = max(self.scales) if self.verified else 1.0
+        return scale**2 * channels * (6.5 if "int8" in self.content else 10)
+
+    @property
     def _threshold(self) -> float:
         default = VERIFIED_THRESHOLD if self.verified else Decoding.threshold
         return default if self.threshold is None else self.threshold
@@ -300,6 +314,9 @@ class SuperPointDetector:
             If an array is not an image, or the images differ in size.
         """
         greys = [to_grey(image) for image in images]
+        for grey in greys[:1]:
+            what = f"{self.name}: {len(greys)} image(s) of {grey.shape[1]} x {grey.shape[0]} pixels"
+            require_memory(int(self._bytes_per_pixel * grey.size * len(greys)), what)
         if len({grey.shape for grey in greys}) > 1:
             raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         if not greys or not greys[0].size:

@@ -15,9 +15,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, short_semi_axis
@@ -26,10 +28,13 @@ from kpbench.fitting.pyramid import Pyramids
 from kpbench.fitting.sector_search import CORE_RADIUS_PX, core_symmetries, estimate_size, search_sectors
 from kpbench.fitting.templates import build_templates
 from kpbench.images import to_grey
+from kpbench.memory import require_memory
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.types import Detections, Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
+TEMPLATE_BYTES_PER_PIXEL = 80
+"""Memory that the detector needs per pixel of the image, bytes. Measured on images of 8 megapixels."""
 VERSION = "1"
 """Version of the method. Raise the version by one when detections change."""
 
@@ -264,6 +269,8 @@ class TemplateDetector:
         grey = to_grey(image)
         if not grey.size:
             return Detections.none()
+        what = f"template: an image of {grey.shape[1]} x {grey.shape[0]} pixels"
+        require_memory(TEMPLATE_BYTES_PER_PIXEL * grey.size, what)
         with one_blas_thread():
             found = self.candidates(grey)
         score = found.score
@@ -309,16 +316,15 @@ def _select_distinct(poses: Poses) -> Int:
 
     A pose near a better pose is kept only if it has another design and a correlation that is nearly as high.
     """
-    n = len(poses)
-    offset = poses.xy[:, None] - poses.xy
-    near = np.linalg.norm(np.einsum("nij,nmj->nmi", np.linalg.inv(poses.A), offset), axis=2) < TEMPLATE_THRESHOLDS.near
-    near |= near.T
-    much_better = poses.ncc[:, None] > poses.ncc + TEMPLATE_THRESHOLDS.much_better_ncc
-    rival = near & ((poses.design[:, None] == poses.design) | much_better)
-    kept = np.zeros(n, bool)
-    for k in range(n):
-        kept[k] = not np.any(rival[kept, k])
-    return np.flatnonzero(kept)
+    inverse, kept = np.linalg.inv(poses.A), np.empty(0, np.int64)
+    for k in range(len(poses)):  # against the kept poses alone: a table of all pairs takes much memory
+        offset = poses.xy[k] - poses.xy[kept]
+        distance = [_lengths(inverse[k : k + 1], offset), _lengths(inverse[kept], offset)]
+        near = np.minimum(*distance) < TEMPLATE_THRESHOLDS.near
+        much_better = poses.ncc[kept] > poses.ncc[k] + TEMPLATE_THRESHOLDS.much_better_ncc
+        if not np.any(near & ((poses.design[kept] == poses.design[k]) | much_better)):
+            kept = np.append(kept, k)
+    return kept
 
 
 def _select_uncovered(xy: Float, A: Float) -> Int:
@@ -326,9 +332,13 @@ def _select_uncovered(xy: Float, A: Float) -> Int:
 
     A point is dropped if it lies in the disc of a better point that is kept.
     """
-    offset = np.einsum("nij,nmj->nmi", np.linalg.inv(A), xy - xy[:, None])
-    inside = np.linalg.norm(offset, axis=2) < TEMPLATE_THRESHOLDS.disc_share
-    kept = np.zeros(len(xy), bool)
+    inverse, kept = np.linalg.inv(A), np.empty(0, np.int64)
     for k in range(len(xy)):
-        kept[k] = not np.any(inside[kept, k])
-    return np.flatnonzero(kept)
+        if not np.any(_lengths(inverse[kept], xy[k] - xy[kept]) < TEMPLATE_THRESHOLDS.disc_share):
+            kept = np.append(kept, k)
+    return kept
+
+
+def _lengths(matrices: NDArray[np.floating[Any]], vectors: Float) -> Float:
+    """Return the lengths (n,) of vectors (n, 2) after multiplication by matrices (n, 2, 2), or by one (1, 2, 2)."""
+    return np.asarray(np.linalg.norm(np.einsum("nij,nj->ni", matrices, vectors), axis=1))

@@ -15,6 +15,7 @@ from kpbench.dataset.shard import Sample
 from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_ladder_mix, draw_paper_mix
 from kpbench.errors import DataError
+from kpbench.memory import require_memory
 from kpbench.patches.design import Patch, shipped_patches
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.lookalikes import draw_lookalikes
@@ -29,8 +30,13 @@ from kpbench.seeds import (
     stream,
 )
 from kpbench.synth.finish import augment_scene, degrade_scene, discs_of
+from kpbench.synth.user_pipeline import try_pipeline
 
 DETERIORATIONS = ("none", "paper", "ladder")
+MOST_SYNTH_PIXELS = 2**26
+"""Largest number of pixels of an image."""
+SYNTH_BYTES_PER_PIXEL = 64
+"""Memory that the making of an image needs per pixel, bytes. Measured on RGB images, with the paper's effects."""
 
 
 @dataclass(frozen=True)
@@ -98,6 +104,10 @@ class SynthConfig:
             (self.seed >= 0, f"`seed` is {self.seed}, expected a whole number from 0"),
             (min(self.size_px) >= 64, f"`size_px` is {size}, expected at least 64x64"),
             (max(self.size_px) <= 16384, f"`size_px` is {size}, at most 16384 a side"),
+            (
+                self.size_px[0] * self.size_px[1] <= MOST_SYNTH_PIXELS,
+                f"`size_px` is {size}, expected at most {MOST_SYNTH_PIXELS} pixels",
+            ),
             (self.channels in (1, 3), f"`channels` is {self.channels}, expected 1 or 3"),
             (
                 self.deteriorate in DETERIORATIONS,
@@ -115,6 +125,9 @@ class SynthConfig:
         ):
             if not is_valid:
                 raise DataError(problem)
+        require_memory(SYNTH_BYTES_PER_PIXEL * self.size_px[0] * self.size_px[1], f"`size_px`: an image of {size}")
+        if self.augmentation is not None:
+            try_pipeline(self.augmentation, self.size_px, self.channels)
 
     @cached_property
     def photos(self) -> PhotoFolder | None:

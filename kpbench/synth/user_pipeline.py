@@ -9,6 +9,9 @@ within a disc, then moves the whole patch.
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -23,6 +26,7 @@ from kpbench.degrade.weather import import_albumentations
 from kpbench.errors import DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project
+from kpbench.memory import limit_process
 from kpbench.render.placement import Placement
 from kpbench.types import UInt8
 
@@ -33,6 +37,10 @@ LEAST_DISC_PIXELS = 12
 
 DEEPEST = 100
 """Levels of a pipeline in YAML."""
+PIPELINE_BYTES, PIPELINE_BYTES_PER_PIXEL = 2**30, 100
+"""Memory that a pipeline may take for an image, bytes: in all, and in addition per pixel of the image."""
+PIPELINE_SECONDS = 5
+"""Processor time that a pipeline may take for two images of up to a megapixel, s; more for larger images."""
 LONGEST_SCALAR = 1000
 """Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
 
@@ -106,6 +114,56 @@ def _interpolate_masks(transform: Any) -> None:
         transform.mask_interpolation = cv2.INTER_LINEAR
 
 
+@lru_cache(maxsize=4)
+def try_pipeline(pipeline: str, size_px: tuple[int, int], channels: int) -> None:
+    """Run a pipeline on two images in a child process, with every transform applied, within limits.
+
+    Raises
+    ------
+    DataError
+        If :func:`run_pipeline` raises the error, or the pipeline takes too much time or memory.
+    """
+    seconds = PIPELINE_SECONDS * max(1.0, size_px[0] * size_px[1] / 1e6)
+    words = [sys.executable, "-I", "-c", _TRIAL, *sys.path]
+    given = json.dumps([pipeline, seconds, [size_px[1], size_px[0], *([3] if channels == 3 else [])]])
+    env = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    try:
+        done = subprocess.run(words, input=given.encode(), capture_output=True, env=env, timeout=60 + 10 * seconds)
+        reply = done.stdout.decode(errors="replace").strip() if not done.returncode else None
+    except subprocess.TimeoutExpired:
+        reply = None
+    if reply:
+        raise DataError(reply.splitlines()[-1])
+    if reply is None:
+        memory = (PIPELINE_BYTES + PIPELINE_BYTES_PER_PIXEL * size_px[0] * size_px[1]) >> 20
+        raise DataError(
+            f"`augmentation`: takes more than {seconds:.0f} s or {memory} MiB for two images of "
+            f"{size_px[0]}x{size_px[1]}, or ends the process"
+        )
+
+
+_TRIAL = "import sys; sys.path[:0] = sys.argv[1:]; from kpbench.synth.user_pipeline import run_trial; run_trial()"
+
+
+def run_trial() -> None:
+    """Run the pipeline that :func:`try_pipeline` sends, and print what is wrong. This is the child process."""
+    pipeline, seconds, shape = json.load(sys.stdin)
+    certain = json.dumps(json.loads(pipeline, object_hook=_make_certain), sort_keys=True)
+    _build_pipeline(certain)
+    cv2.setNumThreads(1)
+    limit_process(PIPELINE_BYTES + PIPELINE_BYTES_PER_PIXEL * shape[0] * shape[1], seconds)
+    try:
+        for seed in range(2):
+            run_pipeline(np.random.default_rng(seed).integers(0, 256, shape, np.uint8), [], certain, seed)
+    except (DataError, MemoryError) as error:
+        print(str(error) or "`augmentation`: takes too much memory")
+
+
+def _make_certain(table: dict[str, Any]) -> dict[str, Any]:
+    """Let a transform of a pipeline always be applied, unless it never is."""
+    return table | {"p": 1.0} if table.get("p") else table
+
+
 def run_pipeline(
     image: UInt8, placements: Sequence[Placement], pipeline: str, seed: int
 ) -> tuple[UInt8, list[Placement | None]]:
@@ -139,7 +197,7 @@ def run_pipeline(
         output = transform(image=image, mask=coordinates)
     except Exception as error:  # a transform may raise anything
         problem = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
-        hint = "; some transforms work with `channels=3` only" if image.ndim == 2 else ""
+        hint = "; some transforms work with `channels=3` only" if image.ndim == 2 and "memory" not in problem else ""
         raise DataError(f"`augmentation`: {problem}{hint}") from None
     result, source_px = np.ascontiguousarray(output["image"]), output["mask"]
     if result.shape != image.shape or result.dtype != np.uint8:

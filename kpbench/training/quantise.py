@@ -12,7 +12,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.detectors.inference import import_onnxruntime, open_session
+from kpbench.detectors.inference import import_onnxruntime, open_session, try_network
 from kpbench.detectors.superpoint import SCALES, SCHEMA, pad_to_cells
 from kpbench.errors import DataError, system_reason
 from kpbench.files import read_bytes
@@ -56,8 +56,11 @@ def export_int8(model: str | Path, out: str | Path) -> Exported:
     require_onnx_target(out)
     try:
         data = read_bytes(model)
+        try_network(data, str(model))
         given = onnx.load_from_string(data)
         content = json.loads({p.key: p.value for p in given.metadata_props}["kpbench"])
+    except DataError:
+        raise
     except Exception as error:  # protobuf raises errors of private classes
         why = system_reason(error) or (str(error) or type(error).__name__).splitlines()[0][:200]
         raise DataError(f"{model}: cannot be read as an ONNX file of kpbench export-model ({why})") from None
