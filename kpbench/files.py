@@ -128,7 +128,7 @@ def read_bytes(path: str | Path, most: int = LARGEST_FILE, is_noted: bool = True
     """
     with open_file(path, is_noted) as file:
         size = os.fstat(file.fileno()).st_size if is_local(path) else 0
-        data = file.read(most + 1) if size <= most else b""
+        data = (file.read(size + 1 if size else -1) or b"") if size <= most else b""  # read(n) takes memory for n bytes
     if max(size, len(data)) > most:
         raise UnreadableFile(f"it has more than {most} bytes")
     return data

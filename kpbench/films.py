@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.containers import require_sound_container
 from kpbench.decoding import MOST_PIXELS_PER_BYTE, is_whole_png, require_opencv_name
 from kpbench.errors import DataError, KpbenchWarning
 from kpbench.pixels import TRANSPARENT, Notes, lay_on_white, png_chunk
@@ -64,6 +65,7 @@ def open_video(path: Path) -> Film:
         If the file cannot be opened as a video.
     """
     require_opencv_name(path)
+    require_sound_container(path)
     capture = _open(cv2.VideoCapture(str(path)), str(path))
     stated = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
     length = stated if 0 < stated <= path.stat().st_size // LEAST_FRAME_BYTES else None

@@ -20,7 +20,7 @@ import numpy as np
 
 from kpbench.decoding import require_opencv_name
 from kpbench.errors import DataError, system_reason
-from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, read_bytes, require_readable
+from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, read_bytes
 from kpbench.films import DEFAULT_FPS, VIDEO_SUFFIXES, Film, name_frames, open_animation, open_camera, open_video
 from kpbench.pixels import Notes, decode_pixels, has_more_pages
 from kpbench.types import UInt8
@@ -104,7 +104,6 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
-        require_readable(path)
         return _source_of(open_video(path), source)
     image = _read_image(path, Notes())
     if isinstance(image, Film):
