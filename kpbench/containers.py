@@ -20,6 +20,13 @@ PART, PART_WITH_FRAMES = (
     re.compile(rb"[0-9A-Fa-f]{2}[ -~]{2}|ix..|JUNK|LIST"),
 )
 """Names of the parts of an AVI outside of the list of frames, and within."""
+EBML, BLOCK = b"\x1a\x45\xdf\xa3", b"\xa3"
+SEGMENT, CLUSTER, GROUP = b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0"
+"""Elements of Matroska and WebM (RFC 9559): the head, the film, a second or so of it, a frame with what it needs."""
+MOST_VP8_PIXELS = 2**26
+"""Largest number of pixels of a frame of VP8."""
+LARGEST_ELEMENT = 2**26
+"""Largest number of bytes of an element that is cut off: FFmpeg takes memory for what an element declares."""
 BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
 """Boxes of MP4 that hold the boxes of a track (ISO 14496-12)."""
 
@@ -42,6 +49,8 @@ def require_sound_container(path: Path) -> None:
                     _check_avi(data)
                 elif data[4:8] in (b"ftyp", b"moov", b"mdat", b"free", b"skip", b"wide"):
                     _check_mp4(data)
+                elif data[:4] == EBML:
+                    _check_matroska(data, 0, len(data))
             except (ValueError, struct.error) as problem:
                 raise DataError(
                     f"{path}: its container is damaged ({problem}); `ffmpeg -i FILE -c copy NEW` may repair it"
@@ -78,6 +87,43 @@ def _check_chunks(data: mmap.mmap, at: int, stop: int, parent: bytes) -> None:
         if kind in (b"hdrl", b"strl", b"movi", b"rec "):
             _check_chunks(data, at + 12, end, kind)
         at = end + length % 2
+
+
+def _check_matroska(data: mmap.mmap, at: int, stop: int) -> None:
+    while at < min(stop, len(data)):
+        name_bytes, size_bytes = _length_of_number(data[at]), 0
+        if at + name_bytes < len(data):
+            size_bytes = _length_of_number(data[at + name_bytes])
+        name, start = data[at : at + name_bytes], at + name_bytes + size_bytes
+        size = int.from_bytes(data[at + name_bytes : start], "big") & ((1 << 7 * size_bytes) - 1)
+        is_list, is_unknown = name in (SEGMENT, CLUSTER, GROUP), size == (1 << 7 * size_bytes) - 1
+        end = stop if is_unknown and is_list else start + size
+        if (
+            not name_bytes
+            or not size_bytes
+            or (end > stop and (stop < len(data) or size > LARGEST_ELEMENT) and not is_list)
+        ):
+            raise ValueError(
+                f"at byte {at}: a part {name.hex()} of {size} bytes, of which {max(0, stop - start)} are there"
+            )
+        if is_list:
+            _check_matroska(data, start, min(end, stop))
+        elif name == BLOCK:
+            _check_vp8_frame(data, start + 4)
+        at = end
+
+
+def _check_vp8_frame(data: mmap.mmap, at: int) -> None:
+    """Refuse a frame of VP8 (RFC 6386, 9.1) that declares many pixels: FFmpeg takes memory for them."""
+    if data[at + 3 : at + 6] == b"\x9d\x01\x2a" and data.find(b"V_VP8", 0, 2**16) >= 0:
+        width, height = (side & 0x3FFF for side in struct.unpack_from("<HH", data, at + 6))
+        if width * height > MOST_VP8_PIXELS:
+            raise ValueError(f"at byte {at}: a frame of {width} x {height} pixels")
+
+
+def _length_of_number(first: int) -> int:
+    """Return the number of bytes of a number of EBML, from its first byte; 0 if there is no such number."""
+    return 9 - first.bit_length() if first else 0
 
 
 def _check_mp4(data: mmap.mmap) -> None:

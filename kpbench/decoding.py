@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.memory import require_memory
+from kpbench.tiff import is_tiff, names_all_pixels
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MOST_PIXELS = int(os.environ.get("OPENCV_IO_MAX_IMAGE_PIXELS", "200000000"))
@@ -55,6 +56,8 @@ def _is_whole(data: NDArray[np.uint8]) -> bool:
     if content.startswith(PNG_SIGNATURE):
         _require_memory(*struct.unpack(">II", content[16:24].ljust(8, b"\0")))
         return is_whole_png(content)
+    if is_tiff(content) and not names_all_pixels(content):
+        return False
     return _is_whole_for_pillow(content)
 
 
@@ -79,6 +82,8 @@ def is_whole_png(content: bytes, first_frame_alone: bool = False) -> bool:
                 break
             return False
         if kind in (b"IHDR", b"PLTE", b"IDAT") and zlib.crc32(kind + chunk) != int.from_bytes(checksum, "big"):
+            return False
+        if kind == b"IHDR" and header:
             return False
         header = header or chunk
         if kind == b"IDAT":
@@ -107,11 +112,13 @@ def _png_bytes(header: bytes) -> int:
 
 def _is_whole_for_pillow(content: bytes) -> bool:
     """Return False if Pillow finds that pixels are missing. OpenCV does not tell. Pillow knows fewer kinds of files."""
-    from PIL import Image
+    from PIL import Image, UnidentifiedImageError
 
+    limit = Image.MAX_IMAGE_PIXELS
     try:
+        Image.MAX_IMAGE_PIXELS = None  # of large images, OpenCV decides
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large images, of which OpenCV decides
+            warnings.simplefilter("ignore")
             with Image.open(io.BytesIO(content)) as image:
                 _require_memory(image.width, image.height)
                 pixels = image.width * image.height
@@ -121,11 +128,15 @@ def _is_whole_for_pillow(content: bytes) -> bool:
                 if pixels <= MOST_PIXELS_TWICE or image.format == "JPEG":
                     image.load()
     except OSError as error:
+        if isinstance(error, UnidentifiedImageError) and content.startswith((b"GIF8", b"RIFF")):
+            return False  # OpenCV would take memory for the size that the file declares
         return not re.search("truncated|broken data stream", str(error))
     except DataError:
         raise
     except Exception:  # Pillow's plugins raise errors of many classes for what they do not know
         return True
+    finally:
+        Image.MAX_IMAGE_PIXELS = limit
     return True
 
 

@@ -22,7 +22,8 @@ from kpbench.decoding import require_opencv_name
 from kpbench.errors import DataError, system_reason
 from kpbench.files import IMAGE_SUFFIXES, image_files, make_folder, read_bytes
 from kpbench.films import DEFAULT_FPS, VIDEO_SUFFIXES, Film, name_frames, open_animation, open_camera, open_video
-from kpbench.pixels import Notes, decode_pixels, has_more_pages
+from kpbench.pixels import Notes, decode_pixels
+from kpbench.tiff import has_more_pages, is_tiff
 from kpbench.types import UInt8
 from kpbench.writing import move_file, require_writable, write_file
 
@@ -155,7 +156,7 @@ def _read_image(path: Path, notes: Notes | None) -> UInt8 | Film | str:
         image = decode_pixels(data, 3, rotate=True, name=path, notes=notes)
     except DataError as error:  # of the memory
         return str(error)
-    if image is not None and notes is not None and has_more_pages(data):
+    if image is not None and notes is not None and is_tiff(data[:4].tobytes()) and has_more_pages(data.tobytes()):
         notes.warn(path, "has several pages, of which only the first is read")
     return UNDECODABLE if image is None else image
 

@@ -7,8 +7,8 @@ A picture of 16 bits keeps the 8 highest of the bits that it uses. A transparent
 from __future__ import annotations
 
 import io
+import re
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,14 @@ from numpy.typing import NDArray
 from kpbench.decoding import decode_image
 from kpbench.errors import KpbenchWarning
 from kpbench.files import open_file
+from kpbench.tiff import is_tiff, read_tag
 from kpbench.types import UInt8
 
 DEPTHS = (8, 10, 12, 14, 16)
 """Bits per sample of cameras that store 16-bit pictures."""
-_PNG_SIGNATURE, _JPEG_SIGNATURE, _TIFF_SIGNATURES = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", (b"II*\0", b"MM\0*")
-_SUBFILE_TYPE, _ORIENTATION, _MAX_SAMPLE_VALUE, _EXTRA_SAMPLES = 254, 274, 281, 338
-"""TIFF tags: what a page is (bit 0: a small copy, bit 2: a mask); how the camera was held; the largest value of the
-samples; what further channels are (1, 2: opacity)."""
+_PNG_SIGNATURE, _JPEG_SIGNATURE = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
+_ORIENTATION, _MAX_SAMPLE_VALUE, _EXTRA_SAMPLES = 274, 281, 338
+"""TIFF tags: how the camera was held; the largest value of the samples; what further channels are (1, 2: opacity)."""
 BAND_PIXELS = 2**17
 """Number of pixels that are laid on white at once."""
 _PNG_GREY_ALPHA, _PNG_RGBA = 4, 6
@@ -83,6 +83,9 @@ def decode_pixels(
                 cv2.cvtColor(special, cv2.COLOR_BGR2GRAY if channels == 1 else cv2.COLOR_BGR2RGB), np.uint8
             )
         image = decode_image(data, flags)
+        largest = _largest_value(data)
+        if image is not None and 0 < largest < 255:
+            image = cv2.LUT(image, np.array([min(255, round(v / largest * 255)) for v in range(256)], np.uint8))
         if image is None or channels == 1:
             return None if image is None else np.asarray(image, np.uint8)
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
@@ -162,7 +165,7 @@ def _decode_deep_or_transparent(
     if is_transparent:
         if notes is not None:
             notes.warn(name, TRANSPARENT)
-        image = lay_on_white(image, is_multiplied=bits == 8 and _is_tiff(data))
+        image = lay_on_white(image, is_multiplied=bits == 8 and is_tiff(data[:4].tobytes()))
     return _rotate(image[..., :3], data) if rotate else np.ascontiguousarray(image[..., :3])
 
 
@@ -171,51 +174,21 @@ def _declared_bits(data: NDArray[np.uint8]) -> int | None:
     if data[:8].tobytes() == _PNG_SIGNATURE:
         declared = max(png_chunk(data, b"sBIT"), default=0)
         return declared if 8 <= declared < 16 else None
-    largest = max(_tiff_tag(data, _MAX_SAMPLE_VALUE), default=0)
+    largest = max(read_tag(data.tobytes(), _MAX_SAMPLE_VALUE), default=0)
     return max(8, largest.bit_length()) if 0 < largest < 2**16 - 1 else None
+
+
+def _largest_value(data: NDArray[np.uint8]) -> int:
+    """Return the value of white that a PGM or a PPM declares, which OpenCV ignores; 255 for any other file."""
+    head = re.sub(rb"#[^\n]*\n", b" ", data[:512].tobytes()) if data[:1].tobytes() == b"P" else b""
+    found = re.match(rb"P[2356]\s+\d+\s+\d+\s+(\d{1,5})\s", head)
+    return int(found[1]) if found else 255
 
 
 def _has_other_channel(data: NDArray[np.uint8]) -> bool:
     """Return whether the fourth channel is no opacity: ink of a CMYK TIFF, infrared, and so on."""
-    return _is_tiff(data) and not {1, 2} & set(_tiff_tag(data, _EXTRA_SAMPLES))
-
-
-def _is_tiff(data: NDArray[np.uint8]) -> bool:
-    return data[:4].tobytes() in _TIFF_SIGNATURES
-
-
-def _tiff_tag(data: NDArray[np.uint8], tag: int) -> tuple[int, ...]:
-    """Return the numbers of a tag of a TIFF; () if there are none."""
-    try:
-        return tuple(int(value) for value in np.ravel(next(_tiff_pages(data)).get(tag, ())))
-    except Exception:  # no TIFF, or any damage: OpenCV has decoded the pixels, so only a hint is lost
-        return ()
-
-
-def _tiff_pages(data: NDArray[np.uint8]) -> Iterator[Any]:
-    """Yield the directory of each page of a TIFF."""
-    if not _is_tiff(data):
-        return
-    from PIL import TiffImagePlugin
-
     content = data.tobytes()
-    at = TiffImagePlugin.ImageFileDirectory_v2(content[:8]).next
-    while at:
-        file, directory = io.BytesIO(content), TiffImagePlugin.ImageFileDirectory_v2(content[:8])
-        file.seek(at)
-        directory.load(file)
-        at = directory.next
-        yield directory
-
-
-def has_more_pages(data: NDArray[np.uint8]) -> bool:
-    """Return whether a TIFF has a second page that is neither a small copy of the first nor a mask."""
-    try:
-        pages = _tiff_pages(data)
-        next(pages)
-        return not int(next(pages).get(_SUBFILE_TYPE, 0)) & 5
-    except Exception:  # any damage, or no second page
-        return False
+    return is_tiff(content) and not {1, 2} & set(read_tag(content, _EXTRA_SAMPLES))
 
 
 def png_chunk(data: NDArray[np.uint8], name: bytes) -> bytes:

@@ -289,7 +289,7 @@ class SuperPointDetector:
         """Memory that the network needs per pixel of an image, bytes. The factors are measured."""
         try:
             channels = min(max(1, int(self.content["recipe"]["network"]["widths"][0])), 4096)
-        except (LookupError, TypeError, ValueError):  # nobody checks this part of the metadata
+        except (LookupError, TypeError, ValueError, OverflowError):  # nobody checks this part of the metadata
             channels = 64
         scale = max(self.scales) if self.verified else 1.0
         return scale**2 * channels * (6.5 if "int8" in self.content else 10)
