@@ -15,7 +15,6 @@ import json
 import os
 import pickle
 import signal
-import stat
 import struct
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from typing import Any, BinaryIO
 import h5py
 import numpy as np
 
-from kpbench.files import is_local, note_read
+from kpbench.files import is_local, note_read, open_file
 from kpbench.hdf5_structure import Layout, StructureError, check_file
 from kpbench.signals import block_end_signals
 
@@ -93,15 +92,8 @@ def _identify(path: Path) -> Key:
 
     h5py says of a file that the system refuses only that it cannot be opened. The file is therefore opened here first.
     """
-    number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe would wait for a writer
-    try:
-        found = os.fstat(number)
-    finally:
-        os.close(number)
-    if stat.S_ISDIR(found.st_mode):
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
-    if not stat.S_ISREG(found.st_mode):
-        raise StructureError("is no regular file")
+    with open_file(path, is_noted=False) as file:
+        found = os.fstat(file.fileno())
     return os.path.abspath(path), found.st_size, found.st_dev, found.st_ino, found.st_mtime_ns
 
 

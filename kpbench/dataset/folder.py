@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, open_shard, shard_errors
 from kpbench.errors import DataError, system_reason
-from kpbench.files import DoubleKeyError, encode_utf8, folder_at, is_local, load_json, note_read, sha256_of
+from kpbench.files import DoubleKeyError, encode_utf8, folder_at, load_json, read_bytes, sha256_of
 from kpbench.hdf5 import MOST_AHEAD
 from kpbench.text import is_name
 from kpbench.types import Truth, UInt8
@@ -93,7 +93,7 @@ def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
 def recorded_digests(folder: Path) -> dict[str, str]:
     """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
     try:
-        shards = load_json((folder / MANIFEST).read_text("utf-8"))["shards"]
+        shards = load_json(read_bytes(folder / MANIFEST, is_noted=False).decode())["shards"]
         return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
     except (OSError, ValueError, KeyError, TypeError):
         return {}
@@ -319,9 +319,7 @@ def _read_manifest(folder: Path) -> Dataset:
     """Return the dataset that the manifest of a folder describes. The shards are not checked."""
     manifest = folder / MANIFEST
     try:
-        if is_local(manifest):
-            note_read(manifest)
-        content = load_json(manifest.read_text("utf-8"))
+        content = load_json(read_bytes(manifest).decode())
         if content["schema"] != DATASET_SCHEMA:
             raise DataError(f"{manifest}: schema is {content['schema']!r}, expected {DATASET_SCHEMA!r}")
         shards = [ShardEntry(**entry) for entry in content["shards"]]

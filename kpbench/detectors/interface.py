@@ -21,6 +21,7 @@ import numpy as np
 from kpbench import __version__
 from kpbench.detectors.program import run_program, split_command
 from kpbench.errors import DataError
+from kpbench.files import read_bytes
 from kpbench.opencv import opencv_version
 from kpbench.patches.design import Patch
 from kpbench.types import Detections, UInt8
@@ -202,7 +203,7 @@ def _digest_detector(name: str, version: str, detector: Any) -> str:
     digest = hashlib.sha256(repr([name, version, opencv_version(), sorted(plain.items())]).encode())
     weights = getattr(detector, "path", None)
     if isinstance(weights, Path) and weights.is_file():
-        digest.update(weights.read_bytes())
+        digest.update(read_bytes(weights))
     return digest.hexdigest()
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
-from kpbench.files import load_json, note_read, path_below
+from kpbench.files import load_json, path_below, read_bytes
 from kpbench.predictions.coco_fields import (
     EXPECTED_IN_COCO,
     CocoAnnotation,
@@ -132,8 +132,7 @@ def open_coco(path: str | Path) -> CocoDataset:
     """
     path = Path(path)
     try:
-        note_read(path)
-        data = path.read_bytes()
+        data = read_bytes(path)
         require_utf8(data)
         with pause_gc():
             content = _decode_annotations(data)

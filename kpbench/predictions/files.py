@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from kpbench.errors import PredictionsError, system_reason
-from kpbench.files import note_read
+from kpbench.files import open_file
 from kpbench.predictions import json_files, table_files
 from kpbench.predictions.decode import pause_gc
 from kpbench.types import Predictions
@@ -62,10 +62,7 @@ def read_predictions(path: str | Path) -> Predictions:
     path = Path(path)
     try:
         suffix = _require_known_suffix(path)
-        note_read(path)
-        if path.is_fifo():  # would wait for a writer, and could be read only once
-            raise PredictionsError("is no regular file")
-        with path.open("rb") as file:  # opened here, so that all formats have one message for a missing file
+        with open_file(path) as file:  # opened here, so that all formats have one message for a missing file
             if not file.read(1):
                 raise PredictionsError("the file is empty")
         with pause_gc():

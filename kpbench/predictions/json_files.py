@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from kpbench.errors import PredictionsError
-from kpbench.files import DoubleKeyError
+from kpbench.files import DoubleKeyError, open_file, read_bytes
 from kpbench.predictions.coco import decode_coco_results
 from kpbench.predictions.decode import (
     PIECE_BYTES,
@@ -35,7 +35,7 @@ def read_json(path: Path) -> Predictions:
     PredictionsError
         At the first fault.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     if data.lstrip()[:1] == b"[":
         return decode_coco_results(data)
 
@@ -84,7 +84,7 @@ def read_jsonl(path: Path) -> Predictions:
             yield batch
             first += len(lines)
 
-    with path.open("rb") as file:
+    with open_file(path) as file:
         header = parse_header(parse_json(file.readline(), "line 1"))
         try:
             return _combine(read_batches(file), header, lambda n: f"line {n + 2}")

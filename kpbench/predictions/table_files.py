@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import KpbenchWarning, PredictionsError, system_reason
+from kpbench.files import read_bytes
 from kpbench.predictions.decode import Place, abbreviate, parse_json
 from kpbench.predictions.fields import H5_COLUMNS, TABLE_COLUMNS, make_header, parse_header
 from kpbench.text import escape_csv_comment
@@ -114,7 +115,7 @@ def read_csv(path: Path) -> Predictions:
     PredictionsError
         At the first fault.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
     is_ended = data.endswith((b"\n", b"\r"))
     data = data.removeprefix(b"\xef\xbb\xbf").rstrip() + b"\n"  # some editors leave blank lines at the end
     header, skipped = {}, 0

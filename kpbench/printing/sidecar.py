@@ -15,7 +15,7 @@ from typing import Any
 
 from kpbench import __version__
 from kpbench.errors import DesignError, system_reason
-from kpbench.files import load_json
+from kpbench.files import load_json, read_bytes
 from kpbench.patches.design import Patch
 from kpbench.printing.page import round_to_nm
 from kpbench.printing.page_format import PageFormat
@@ -98,7 +98,7 @@ def correct_sidecars(folder: str | Path, measured_mm: tuple[float, float]) -> li
         if path.name.endswith(".measured.json"):
             continue
         try:
-            sidecar = load_json(path.read_bytes())
+            sidecar = load_json(read_bytes(path))
             if not isinstance(sidecar, dict) or sidecar.get("schema") not in (BOARD_SCHEMA, SHEET_SCHEMA):
                 continue
             with name_source(path, DesignError):
