@@ -1,6 +1,6 @@
-"""Containers of films: find damage in AVI and MP4 files that FFmpeg would read as other frames than those in the file.
+"""Containers of films: find damage in AVI, MP4 and Matroska files of which FFmpeg would make other frames.
 
-Both consist of parts, each with a name and a length, which hold further parts. FFmpeg searches for frames behind a
+All consist of parts, each with a name and a length, which hold further parts. FFmpeg searches for frames behind a
 part whose length is damaged. It then repeats frames, leaves frames out, or takes much memory.
 """
 
@@ -20,7 +20,7 @@ PART, PART_WITH_FRAMES = (
     re.compile(rb"[0-9A-Fa-f]{2}[ -~]{2}|ix..|JUNK|LIST"),
 )
 """Names of the parts of an AVI outside of the list of frames, and within."""
-EBML, BLOCK = b"\x1a\x45\xdf\xa3", b"\xa3"
+EBML, SIMPLE_BLOCK = b"\x1a\x45\xdf\xa3", b"\xa3"
 SEGMENT, CLUSTER, GROUP = b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0"
 """Elements of Matroska and WebM (RFC 9559): the head, the film, a second or so of it, a frame with what it needs."""
 MOST_VP8_PIXELS = 2**26
@@ -32,7 +32,7 @@ BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
 
 
 def require_sound_container(path: Path) -> None:
-    """Refuse an AVI or an MP4 with damaged lengths or tables. A file that is cut off is accepted.
+    """Refuse an AVI, an MP4 or a Matroska file with damaged lengths or tables. A file that is cut off is accepted.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def _check_matroska(data: mmap.mmap, at: int, stop: int) -> None:
             )
         if is_list:
             _check_matroska(data, start, min(end, stop))
-        elif name == BLOCK:
+        elif name == SIMPLE_BLOCK:
             _check_vp8_frame(data, start + 4)
         at = end
 

@@ -74,8 +74,9 @@ def decode_pixels(
     ndarray or None
         None if the data cannot be decoded.
     """
+    is_jpeg = data[:3].tobytes() == _JPEG_SIGNATURE  # OpenCV and Pillow rotate some by a damaged EXIF block in two ways
     flags = cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR
-    flags |= 0 if rotate else cv2.IMREAD_IGNORE_ORIENTATION
+    flags |= 0 if rotate and not is_jpeg else cv2.IMREAD_IGNORE_ORIENTATION
     try:
         special = None if _is_plain(data) else _decode_deep_or_transparent(data, rotate, name, notes)
         if special is not None:
@@ -83,6 +84,8 @@ def decode_pixels(
                 cv2.cvtColor(special, cv2.COLOR_BGR2GRAY if channels == 1 else cv2.COLOR_BGR2RGB), np.uint8
             )
         image = decode_image(data, flags)
+        if image is not None and rotate and is_jpeg:
+            image = _rotate(image, data)
         largest = _largest_value(data)
         if image is not None and 0 < largest < 255:
             image = cv2.LUT(image, np.array([min(255, round(v / largest * 255)) for v in range(256)], np.uint8))
@@ -204,11 +207,11 @@ def png_chunk(data: NDArray[np.uint8], name: bytes) -> bytes:
     return b""
 
 
-def _rotate(image: UInt8, data: NDArray[np.uint8]) -> UInt8:
+def _rotate(image: NDArray[Any], data: NDArray[np.uint8]) -> NDArray[Any]:
     """Rotate and flip an image as its EXIF data says."""
     orientation = _size_and_orientation(io.BytesIO(data.tobytes()))[1]
     if orientation in SIDEWAYS:
-        image = image.transpose(1, 0, 2)
+        image = image.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
         image = image[::-1]
     if orientation in (2, 3, 6, 7):

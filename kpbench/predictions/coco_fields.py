@@ -200,7 +200,7 @@ def _require_different(annotations: Sequence[CocoAnnotation], points: Float, lab
     rows = np.flatnonzero(labelled)
     image_id, x, y = column(annotations, "image_id", np.int64)[rows], points[rows, 0], points[rows, 1]
     order = np.argsort(x)  # few keypoints share their x, so that little is left to sort
-    shared = np.append(np.diff(x[order]) == 0, False)
+    shared = np.append(np.diff(x[order]) == 0, False)[: len(order)]
     order = order[shared | np.roll(shared, 1)]
     order = order[np.lexsort((y[order], x[order], image_id[order]))]
     same = np.ones(max(0, len(order) - 1), bool)

@@ -86,7 +86,11 @@ def test_a_path_that_is_no_file_is_named_and_nothing_waits(file, kind):
         path.mkdir()
     if kind == "pipe":
         os.mkfifo(path)
-    reason = {"missing": "cannot be read, No such", "folder": "cannot be read, Is a directory", "pipe": "regular file"}
+    reason = {
+        "missing": "cannot be read, No such",
+        "folder": "cannot be read, Is a directory",
+        "pipe": "cannot be read, it is a pipe",
+    }
     assert problem(path, read).startswith(f"{path}: ")
     assert reason[kind] in problem(path, read)
 
