@@ -20,6 +20,8 @@ PART, PART_WITH_FRAMES = (
     re.compile(rb"[0-9A-Fa-f]{2}[ -~]{2}|ix..|JUNK|LIST"),
 )
 """Names of the parts of an AVI outside of the list of frames, and within."""
+CODEC = re.compile(rb"[ -~]{4}|.\x00\x00\x00", re.DOTALL)
+"""The codec of a stream of pictures in an AVI: four letters, or a small number."""
 EBML, SIMPLE_BLOCK = b"\x1a\x45\xdf\xa3", b"\xa3"
 SEGMENT, CLUSTER, GROUP = b"\x18\x53\x80\x67", b"\x1f\x43\xb6\x75", b"\xa0"
 """Elements of Matroska and WebM (RFC 9559): the head, the film, a second or so of it, a frame with what it needs."""
@@ -74,6 +76,7 @@ def _end_of_list(at: int, length: int, stop: int) -> int:
 
 
 def _check_chunks(data: mmap.mmap, at: int, stop: int, parent: bytes) -> None:
+    is_video = parent == b"strl" and data[at + 8 : at + 12] == b"vids"
     while at + 8 <= min(stop, len(data)):
         name, length = data[at : at + 4], int.from_bytes(data[at + 4 : at + 8], "little")
         kind = data[at + 8 : at + 12] if name == b"LIST" else b""
@@ -84,6 +87,8 @@ def _check_chunks(data: mmap.mmap, at: int, stop: int, parent: bytes) -> None:
         is_cut_off = stop >= len(data) and (holds_frames or parent == b"RIFF")
         if end > stop and not is_cut_off:
             raise ValueError(f"at byte {at}: a part of {length} bytes, of which {stop - at - 8} are there")
+        if is_video and name == b"strf" and not CODEC.fullmatch(codec := data[at + 24 : at + 28]):
+            raise ValueError(f"at byte {at}: a codec with the name {codec!r}")
         if kind in (b"hdrl", b"strl", b"movi", b"rec "):
             _check_chunks(data, at + 12, end, kind)
         at = end + length % 2
