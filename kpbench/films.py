@@ -6,6 +6,7 @@ A frame that cannot be read is None, in its true place. ``docs/reference/detecto
 from __future__ import annotations
 
 import io
+import struct
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -174,10 +175,11 @@ def open_animation(path: Path, data: NDArray[np.uint8], notes: Notes | None = No
         return None
     if length < 2:
         return None
-    pixels = image.width * image.height
+    width, height = _largest_gif_extent(data.tobytes(), image.size) if is_gif else image.size
+    pixels = width * height
     if pixels > MOST_FRAME_PIXELS or length * pixels > MOST_PIXELS_PER_BYTE * len(data):
         raise DataError(
-            f"{path}: declares {length} frames of {image.width} x {image.height} in {len(data)} bytes, "
+            f"{path}: declares {length} frames of {width} x {height} in {len(data)} bytes, "
             f"expected at most {MOST_FRAME_PIXELS} pixels, and {MOST_PIXELS_PER_BYTE} pixels of all frames per byte"
         )
     if is_gif and not data[-64:].tobytes().rstrip(b"\0").endswith(b";"):
@@ -212,6 +214,27 @@ def _open_frames(content: bytes, is_webp: bool) -> tuple[Any, int]:
         return image, getattr(image, "n_frames", 1) + lost
     except Exception:  # a GIF that ends within the head of a frame
         return Image.open(io.BytesIO(content)), image.tell() + 2
+
+
+def _largest_gif_extent(content: bytes, size: tuple[int, int]) -> tuple[int, int]:
+    """Return the width and height that hold all frames of a GIF. A frame may reach out of the picture's stated size."""
+    (width, height), at = size, 13 + _color_table_bytes(content[10])
+    while at + 10 <= len(content) and content[at] in b"\x21\x2c":
+        if content[at] == 0x2C:
+            x, y, w, h = struct.unpack_from("<4H", content, at + 1)
+            width, height = max(width, x + w), max(height, y + h)
+            at += 11 + _color_table_bytes(content[at + 9])
+        else:
+            at += 2
+        while at < len(content) and content[at]:
+            at += 1 + content[at]
+        at += 1
+    return width, height
+
+
+def _color_table_bytes(flags: int) -> int:
+    """Return the size of the table of colours that follows a head of a GIF with these flags."""
+    return 3 << (flags & 7) + 1 if flags & 0x80 else 0
 
 
 def _keep_whole_frames(content: bytes) -> tuple[bytes, int]:

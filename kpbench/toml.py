@@ -20,7 +20,7 @@ LARGEST = sys.float_info.max
 """Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
 DEEPEST_KEY = 50
 """Largest number of parts of a dotted key, such as ``a.b.c``."""
-DEEP_KEY = re.compile(rf"""(?:[\w"'-]+[ \t]*\.[ \t]*){{{DEEPEST_KEY}}}""")
+DEEP_KEY = re.compile(rf"""(?<![\w"'-])(?:[\w"'-]++[ \t]*+\.[ \t]*+){{{DEEPEST_KEY}}}""")
 MOST_ENTRIES = 10_000
 """Largest number of entries of a list of tables."""
 

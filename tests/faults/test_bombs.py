@@ -5,6 +5,7 @@ import resource
 import struct
 import subprocess
 import sys
+import time
 import zlib
 from pathlib import Path
 
@@ -12,11 +13,13 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 
 import kpbench
 from kpbench.cli import main
-from kpbench.errors import KpbenchError, PredictionsError
-from kpbench.images import decode_photo, read_rgb
+from kpbench.errors import DataError, DesignError, KpbenchError, PredictionsError
+from kpbench.images import decode_photo, open_images, read_rgb
+from kpbench.patches.design import load_patch
 from kpbench.synth.user_pipeline import load_augmentation
 
 CASES = Path(__file__).parent / "cases"
@@ -205,6 +208,28 @@ def test_an_export_that_the_disk_cannot_hold(here, dataset, monkeypatch):
     for file_format in ("coco", "yolo", "webdataset"):
         line = one_line(run("export", dataset.path, "--format", file_format, "--out", f"out-{file_format}"))
         assert line.startswith(f"out-{file_format}: 6 images need about ")
+
+
+@pytest.mark.parametrize("letter", ["a", "-", "'", " ", "a.", "é"])
+def test_a_long_word_in_a_design_is_read_in_linear_time(tmp_path, letter):
+    """A search for deep keys looked at every rest of a word: 100,000 letters took minutes."""
+    path = tmp_path / "long.toml"
+    path.write_text(f'x = "{letter * (100_000 // len(letter))}"\n')
+    start = time.process_time()
+    with pytest.raises(DesignError, match=r"long\.toml: "):
+        load_patch(path)
+    assert time.process_time() - start < 1
+
+
+def test_a_frame_of_a_gif_that_reaches_out_of_the_picture_counts(tmp_path):
+    frames = [Image.new("P", (8, 8), n) for n in (1, 2)]
+    frames[0].save(tmp_path / "big.gif", save_all=True, append_images=frames[1:])
+    data = bytearray((tmp_path / "big.gif").read_bytes())
+    second = data.rfind(b"\x2c\x00\x00\x00\x00")
+    data[second + 5 : second + 9] = struct.pack("<2H", 6000, 6000)
+    (tmp_path / "big.gif").write_bytes(data)
+    with pytest.raises(DataError, match=r"big\.gif: declares 2 frames of 6000 x 6000"):
+        list(open_images(str(tmp_path / "big.gif")).images)
 
 
 def test_nothing_here_took_much_memory():
