@@ -222,7 +222,7 @@ def test_a_long_word_in_a_design_is_read_in_linear_time(tmp_path, letter):
 
 
 def test_a_frame_of_a_gif_that_reaches_out_of_the_picture_counts(tmp_path):
-    frames = [Image.new("P", (8, 8), n) for n in (1, 2)]
+    frames = [Image.new("L", (8, 8), grey) for grey in (0, 200)]
     frames[0].save(tmp_path / "big.gif", save_all=True, append_images=frames[1:])
     data = bytearray((tmp_path / "big.gif").read_bytes())
     second = data.rfind(b"\x2c\x00\x00\x00\x00")
