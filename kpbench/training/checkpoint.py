@@ -115,8 +115,10 @@ def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) 
     write_file(path, save(packed, {"kpbench": json.dumps(content)}))
 
 
-def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def read_checkpoint(path: str | Path, is_noted: bool = True) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return the metadata and the tensors of a checkpoint.
+
+    ``is_noted`` : False for a checkpoint that the running command may replace later.
 
     Raises
     ------
@@ -126,7 +128,7 @@ def read_checkpoint(path: str | Path) -> tuple[dict[str, Any], dict[str, Tensor]
     from safetensors import SafetensorError, safe_open
 
     try:
-        open_file(path).close()  # refuses what is no file; the library would wait or end the process
+        open_file(path, is_noted).close()  # refuses what is no file; the library would wait or end the process
         with safe_open(path, framework="pt") as file:
             content = json.loads((file.metadata() or {}).get("kpbench", "{}"))
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
@@ -176,7 +178,7 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
     DataError
         If the file is no checkpoint, or if its recipe or its designs differ from those of the training.
     """
-    content, tensors = read_checkpoint(path)
+    content, tensors = read_checkpoint(path, is_noted=False)
     theirs = parse_recipe(content["recipe"], str(path))
     changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(state.recipe, f.name)]
     if changed:
