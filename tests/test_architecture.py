@@ -26,6 +26,8 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__main_
 GROUND = {
     "errors": [],
     "types": ["errors"],
+    "portable": ["types"],
+    "filters": ["types", "portable"],
     "files": ["errors"],
     "text": [],
     "toml": ["errors", "files", "text"],

@@ -9,7 +9,6 @@ from .effects import jpeg as jpeg
 from .effects import low_light as low_light
 from .effects import noise as noise
 from .effects import occlusion as occlusion
-from .effects import rainfall as rainfall
 from .effects import shadow_edge as shadow_edge
 from .ladder import LADDER as LADDER
 from .ladder import Severity as Severity
@@ -20,6 +19,7 @@ from .ladder import draw_paper_mix as draw_paper_mix
 from .own_images import degrade_files as degrade_files
 from .own_images import open_own_images as open_own_images
 from .weather import rain as rain
+from .weather import rainfall as rainfall
 from .weather import shadow as shadow
 
 __all__: list[str]

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
+from kpbench.filters import box_filter, filter_image, filter_separably, gaussian_taps
 from kpbench.geometry.coverage import rasterise
 from kpbench.geometry.outline import arc_vertices
+from kpbench.portable import cos_sin, matmul
 from kpbench.types import Float, UInt8
-
-BORDER_MODE = cv2.BORDER_REFLECT_101
-"""Border rule of all kernels: the image continues beyond its border, mirrored about the outermost pixel."""
 
 
 def blur(image: UInt8, kernel_px: float) -> UInt8:
@@ -39,9 +37,8 @@ def blur(image: UInt8, kernel_px: float) -> UInt8:
     array([[ 0, 30, 30, 30,  0]], dtype=uint8)
     """
     if kernel_px % 2 == 1:
-        return np.asarray(cv2.blur(image, (int(kernel_px), int(kernel_px)), borderType=BORDER_MODE), np.uint8)
-    taps = box_taps(kernel_px)
-    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=BORDER_MODE), np.uint8)
+        return box_filter(image, int(kernel_px))
+    return filter_separably(image, box_taps(kernel_px))
 
 
 def box_taps(kernel_px: float) -> Float:
@@ -72,15 +69,7 @@ def gaussian_blur(image: UInt8, sigma_px: float) -> UInt8:
     >>> gaussian_blur(np.array([[0, 0, 0, 100, 0, 0, 0]], np.uint8), sigma_px=1)
     array([[ 1,  5, 24, 40, 24,  5,  1]], dtype=uint8)
     """
-    taps = gaussian_taps(sigma_px)
-    return np.asarray(cv2.sepFilter2D(image, -1, taps, taps, borderType=BORDER_MODE), np.uint8)
-
-
-def gaussian_taps(sigma_px: float) -> Float:
-    """Return the weights of a Gaussian, out to four standard deviations, centred on the middle tap."""
-    reach = int(np.ceil(4 * sigma_px))
-    taps = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
-    return np.asarray(taps / taps.sum())
+    return filter_separably(image, gaussian_taps(sigma_px))
 
 
 def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
@@ -105,23 +94,20 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
     >>> motion_blur(np.array([[0, 0, 90, 0, 0]], np.uint8), length_px=3, angle_deg=0)
     array([[ 0, 30, 30, 30,  0]], dtype=uint8)
     """
-    kernel = line_kernel(length_px, angle_deg)
-    # OpenCV filters float32 in half the time of 8 bits
-    spread = cv2.filter2D(image.astype(np.float32), -1, kernel, borderType=BORDER_MODE)
-    return np.asarray(cv2.add(spread, np.zeros(1), dtype=cv2.CV_8U), np.uint8)
+    return filter_image(image, line_kernel(length_px, angle_deg))
 
 
 @lru_cache(maxsize=2048)  # holds all kernels of the paper's mix; the ladder's kernels rarely repeat
 def line_kernel(length_px: float, angle_deg: float) -> Float:
     """Return the exact area coverage of a line, one pixel wide, through the kernel's centre, scaled to the sum 1."""
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    c, s = map(float, cos_sin(np.radians(angle_deg)))
     half_length, half_width = length_px / 2, 0.5
     corners = np.array([
         [half_length, half_width], [-half_length, half_width], [-half_length, -half_width], [half_length, -half_width],
     ])  # fmt: skip
     reach = int(np.ceil(half_length + 1)) + 1
     box = (-reach, -reach, 2 * reach + 1, 2 * reach + 1)
-    kernel = rasterise([[corners @ np.array([[c, s], [-s, c]])]], [box])[0]
+    kernel = rasterise([[matmul(corners, np.array([[c, s], [-s, c]]))]], [box])[0]
     kernel = kernel + kernel[::-1, ::-1]  # makes the kernel point-symmetric to the last bit
     kernel[kernel < 1e-9] = 0.0  # removes rounding errors; OpenCV is quicker where a weight is 0
     border = int((kernel.any(axis=0) | kernel.any(axis=1)).argmax())
@@ -150,7 +136,7 @@ def defocus(image: UInt8, radius_px: float) -> UInt8:
     >>> int(defocus(spot, radius_px=2)[4, 4])  # 255 / (4 pi)
     20
     """
-    return np.asarray(cv2.filter2D(image, -1, disc_kernel(radius_px), borderType=BORDER_MODE), np.uint8)
+    return filter_image(image, disc_kernel(radius_px))
 
 
 @lru_cache(maxsize=64)

@@ -18,6 +18,7 @@ import numpy as np
 
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
 from kpbench.images import encode_jpeg
+from kpbench.portable import cos_sin, exp, log, matmul
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -31,7 +32,7 @@ glow's reach, and the intensity as a fraction of the glow's strength.
 """
 
 
-def _to_uint8(image: Any) -> UInt8:
+def to_uint8(image: Any) -> UInt8:
     """Round grey levels and clip them to the range 0 to 255."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
 
@@ -42,7 +43,7 @@ def _normal_quantiles() -> Float:
     from scipy.special import ndtri
 
     values = ndtri((np.arange(2**16) + 0.5) / 2**16)
-    return np.asarray(values / values.std())
+    return np.asarray(np.round(values / values.std(), 6))  # rounded to remove what depends on the processor
 
 
 def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
@@ -72,8 +73,9 @@ def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     # pixels are whole numbers, so noise can be rounded before the addition; a uniform 16-bit number picks a rounded
     # quantile, which is quicker than a normal generator
     levels = np.rint(sigma * _normal_quantiles()).astype(np.int16)
-    field = levels[np.frombuffer(rng.bytes(2 * image.size), "<u2")].reshape(image.shape)
-    return np.asarray(cv2.add(image, field, dtype=cv2.CV_8U), np.uint8)
+    draws = np.frombuffer(rng.bytes(2 * image.size), "<u2").astype(np.uint16, copy=False)
+    field = cv2.LUT(draws.reshape(len(image), -1), levels)  # takes a third of the time of NumPy's indexing
+    return np.asarray(cv2.add(image, field.reshape(image.shape), dtype=cv2.CV_8U), np.uint8)
 
 
 def dimming(image: UInt8, k: float, law: Literal["tenth", "literal"] = "tenth") -> UInt8:
@@ -102,7 +104,7 @@ def dimming(image: UInt8, k: float, law: Literal["tenth", "literal"] = "tenth") 
     >>> int(dimming(white, 10)[0, 0]), int(dimming(white, 10, law="literal")[0, 0])
     (153, 2)
     """
-    return brightness(image, 0.6 ** (k / 10 if law == "tenth" else k))
+    return brightness(image, float(exp((k / 10 if law == "tenth" else k) * log(0.6))))
 
 
 def brightness(image: UInt8, factor: float) -> UInt8:
@@ -124,7 +126,7 @@ def brightness(image: UInt8, factor: float) -> UInt8:
     >>> brightness(np.array([[10, 100, 250]], np.uint8), 1.2)
     array([[ 12, 120, 255]], dtype=uint8)
     """
-    table = _to_uint8(np.arange(256) * factor)
+    table = to_uint8(np.arange(256) * factor)
     return np.asarray(cv2.LUT(image, table), np.uint8)
 
 
@@ -136,7 +138,7 @@ def _offsets_from(image: UInt8, x: float, y: float) -> tuple[Any, Any]:
     return dx[None], dy[:, None]
 
 
-def _for_all_channels(field: Any, image: UInt8) -> Any:
+def for_all_channels(field: Any, image: UInt8) -> Any:
     """Return a field of shape (H, W) in a shape that broadcasts with the image, grey or RGB."""
     return field if image.ndim == 2 else field[..., None]
 
@@ -170,52 +172,9 @@ def shadow_edge(image: UInt8, x: float, y: float, angle_deg: float, light: float
     array([[200, 200, 200, 150, 100, 100, 100]], dtype=uint8)
     """
     dx, dy = _offsets_from(image, x, y)
-    c, s = (np.float32(v) for v in (np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))))
+    c, s = (np.float32(v) for v in cos_sin(np.radians(angle_deg)))
     shaded = np.clip((dx * c + dy * s) / np.float32(penumbra_px) + np.float32(0.5), 0, 1)
-    return _to_uint8(image * _for_all_channels(1 - np.float32(1 - light) * shaded, image))
-
-
-def rainfall(image: UInt8, seed: int, streaks: int, length_px: float, slant_deg: float) -> UInt8:
-    """Draw bright streaks of falling drops over the image.
-
-    The paper's rain is :func:`rain`, whose strength is fixed. Here, ``streaks`` sets the strength.
-
-    Parameters
-    ----------
-    image : ndarray of shape (H, W) or (H, W, 3), uint8
-    seed : int
-        Seed of the place, slant, length, width and opacity of each streak.
-    streaks : int
-        Number of streaks.
-    length_px : float
-        Mean length of the streaks, px.
-    slant_deg : float
-        Mean angle of the streaks, from straight down towards +x, degrees.
-
-    Returns
-    -------
-    ndarray of the same shape, uint8
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kpbench.degrade import rainfall
-    >>> wet = rainfall(np.full((60, 80), 90, np.uint8), seed=1, streaks=20, length_px=8, slant_deg=10)
-    >>> int(wet.min()), bool(wet.max() > 100)
-    (90, True)
-    """
-    rng = np.random.default_rng(seed)
-    rows, columns = image.shape[:2]
-    layer = np.zeros((rows, columns), np.uint8)
-    start = rng.uniform(-0.05, 1.05, (streaks, 2)) * (columns, rows)
-    slant = np.radians(slant_deg + rng.normal(0, 2, streaks))
-    step = (length_px * rng.uniform(0.5, 1.5, streaks))[:, None] * np.column_stack([np.sin(slant), np.cos(slant)])
-    opacity, is_thick = rng.integers(60, 200, streaks), rng.random(streaks) < 0.25
-    ends = np.rint(16 * np.stack([start, start + step], axis=1)).astype(int).tolist()
-    for (a, b), level, thick in zip(ends, opacity.tolist(), is_thick.tolist(), strict=True):
-        cv2.line(layer, a, b, level, 2 if thick else 1, cv2.LINE_AA, 4)
-    share = _for_all_channels(cv2.blur(layer, (3, 3)).astype(np.float32) / 255, image)
-    return _to_uint8(image + (np.float32(225) - image) * share)
+    return to_uint8(image * for_all_channels(1 - np.float32(1 - light) * shaded, image))
 
 
 def jpeg(image: UInt8, quality: int) -> UInt8:
@@ -286,12 +245,12 @@ def low_light(
     >>> round(grey.mean()), round(grey.std())
     (128, 7)
     """
-    light = 2.0**-stops
+    light = float(exp(-stops * log(2.0)))
     electrons = rng.poisson(image * (full_well_e * light / 255)).astype(np.float32)
     electrons += np.float32(read_noise_e) * rng.standard_normal(image.shape, dtype=np.float32)
     gain, steps = min(most_gain, 1 / light), 2**bits - 1
     numbers = np.clip(np.rint(electrons * np.float32(gain * steps / full_well_e)), 0, steps)
-    return _to_uint8(numbers * np.float32(255 / (steps * gain * light)))
+    return to_uint8(numbers * np.float32(255 / (steps * gain * light)))
 
 
 def _strip_corners(strips: list[list[float]]) -> list[Float]:
@@ -299,8 +258,8 @@ def _strip_corners(strips: list[list[float]]) -> list[Float]:
     unit_square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     corners = []
     for x, y, length, width, angle_deg, _ in strips:
-        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-        corners.append(unit_square * (length, width) @ np.array([[c, s], [-s, c]]) + (x, y))
+        c, s = map(float, cos_sin(np.radians(angle_deg)))
+        corners.append(matmul(unit_square * (length, width), np.array([[c, s], [-s, c]])) + np.array([x, y]))
     return corners
 
 
@@ -330,8 +289,8 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
         in_image, in_box = clip_to_image(box, image)
         part = result[in_image]
         if part.size:
-            cover = _for_all_channels(rasterise([[polygon]], [box])[0][in_box], image)
-            result[in_image] = _to_uint8(part + (float(strip[5]) - part) * cover)
+            cover = for_all_channels(rasterise([[polygon]], [box])[0][in_box], image)
+            result[in_image] = to_uint8(part + (float(strip[5]) - part) * cover)
     return result
 
 
@@ -374,11 +333,26 @@ def flare(image: UInt8, x: float, y: float, strength: float, reach_px: float) ->
     (150, 50)
     """
     dx, dy = _offsets_from(image, x, y)
-    glow = np.exp(-np.sqrt(dx * dx + dy * dy) / np.float32(reach_px)) * np.float32(strength)
+    glow = _exp_falling(np.sqrt(dx * dx + dy * dy) / np.float32(reach_px)) * np.float32(strength)
     middle_x, middle_y = (image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2
     for position, size, intensity in FLARE_GHOSTS:
         dx, dy = _offsets_from(image, middle_x + position * (x - middle_x), middle_y + position * (y - middle_y))
         radius = np.float32(size * reach_px)
         ghost = np.clip((radius - np.sqrt(dx * dx + dy * dy)) / 4 + 0.5, 0, 1)
         glow += np.float32(intensity * strength) * ghost
-    return _to_uint8(image + _for_all_channels(glow, image))
+    return to_uint8(image + for_all_channels(glow, image))
+
+
+@lru_cache(maxsize=1)
+def _exp_table() -> Any:
+    """Return exp(-x) for x = 0, 1/256, …, 32, float32."""
+    return exp(-np.arange(32 * 256 + 1) / 256).astype(np.float32)
+
+
+def _exp_falling(x: Any) -> Any:
+    """Return exp(-x) of a float32 array of numbers from 0, linear between the table's entries, accurate to 2e-6."""
+    steps = np.minimum(x * np.float32(256), np.float32(32 * 256 - 1))
+    below = np.floor(steps)
+    table, nth = _exp_table(), below.astype(np.int32)
+    low = table[nth]
+    return low + (table[nth + 1] - low) * (steps - below)

@@ -18,11 +18,11 @@ from kpbench.degrade.effects import (
     low_light,
     noise,
     occlusion,
-    rainfall,
     shadow_edge,
 )
-from kpbench.degrade.weather import rain, shadow
+from kpbench.degrade.weather import rain, rainfall, shadow
 from kpbench.errors import DataError
+from kpbench.portable import arctan2, cos_sin
 from kpbench.types import Float, UInt8
 
 Discs = Float
@@ -99,13 +99,15 @@ def _draw_rainfall(rng: np.random.Generator, level: float, size_px: tuple[int, i
 def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
     """Draw one strip per patch that covers ``level`` percent of the patch's disc from a random side."""
     border = np.linspace(1, -1, 2001)
-    hidden = (np.arccos(border) - border * np.sqrt(1 - border**2)) / np.pi  # share of a unit disc beyond x = border
+    hidden = (
+        arctan2(np.sqrt(1 - border**2), border) - border * np.sqrt(1 - border**2)
+    ) / np.pi  # share of a unit disc beyond x = border
     start = float(np.interp(level / 100, hidden, border))
     end = 1.3  # far end of the strip, radii from the patch's centre: beyond the disc
     strips = []
     for x, y, radius in discs:
         angle_deg, grey = _draw_angle_deg(rng, 360), float(rng.integers(20, 236))
-        c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+        c, s = cos_sin(np.radians(angle_deg))
         length, middle = (end - start) * radius, (end + start) / 2 * radius
         strip = (x + c * middle, y + s * middle, length, 2 * end * radius)
         strips.append([*(round(float(v), 3) for v in strip), angle_deg, grey])
@@ -115,8 +117,8 @@ def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, 
 def _draw_flare(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
     """Draw a lamp, one to four radii from the centre of one of the patches."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
-    angle, distance = rng.uniform(0, 2 * np.pi), radius * rng.uniform(1, 4)
-    place = {"x": round(float(x + distance * np.cos(angle)), 2), "y": round(float(y + distance * np.sin(angle)), 2)}
+    (c, s), distance = cos_sin(rng.uniform(0, 2 * np.pi)), radius * rng.uniform(1, 4)
+    place = {"x": round(float(x + distance * c), 2), "y": round(float(y + distance * s), 2)}
     return {"effect": "flare", **place, "strength": level, "reach_px": round(0.15 * size_px[0], 2)}
 
 

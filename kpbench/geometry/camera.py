@@ -7,16 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kpbench.portable import cos_sin, matmul
 from kpbench.types import Float
 
 
 def rotation_xyz(x_deg: float, y_deg: float, z_deg: float) -> Float:
     """Return the rotation about the fixed axes z, then y, then x: ``Rx @ Ry @ Rz``, shape (3, 3)."""
-    (cx, cy, cz), (sx, sy, sz) = np.cos(a := np.radians([x_deg, y_deg, z_deg])), np.sin(a)
+    (cx, cy, cz), (sx, sy, sz) = cos_sin(np.radians([x_deg, y_deg, z_deg]))
     Rx = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
     Ry = np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     Rz = np.array([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]])
-    return np.asarray(Rx @ Ry @ Rz)
+    return matmul(matmul(Rx, Ry), Rz)
 
 
 def plane_to_camera(R_plane2camera: Float, t_camera: ArrayLike) -> Float:
@@ -98,4 +99,4 @@ class Camera:
             [x * y * slope + 2 * p1 * x + 2 * p2 * y, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x],
         ])  # fmt: skip
         point = self.distort(np.array([[x, y]]))[0]
-        return np.vstack([np.column_stack([J, point - J @ (x, y)]), [0.0, 0.0, 1.0]])
+        return np.vstack([np.column_stack([J, point - (J[:, 0] * x + J[:, 1] * y)]), [0.0, 0.0, 1.0]])

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kpbench.portable import arctan2, matmul
 from kpbench.types import Float
 
 
@@ -46,7 +47,7 @@ def project(H_a2b: Float, points_a: ArrayLike) -> Float:
            [120.,  50.]])
     """
     points = np.asarray(points_a, np.float64)
-    mapped = points @ H_a2b[:, :2].T + H_a2b[:, 2]
+    mapped = points[:, :1] * H_a2b[:, 0] + points[:, 1:] * H_a2b[:, 1] + H_a2b[:, 2]
     return np.asarray(mapped[:, :2] / mapped[:, 2:])
 
 
@@ -99,10 +100,26 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     dual = _project_dual_conics(H_patch2image)
     x, y = dual[:, 0, 2], dual[:, 1, 2]
     xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
-    middle, spread = (xx + yy) / 2, np.hypot((xx - yy) / 2, xy)
+    return dual[:, :2, 2], *ellipse_axes(xx, yy, xy)
+
+
+def ellipse_axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
+    """Return semi-axes and angles of the ellipses ``dᵀ M⁻¹ d = 1``, d from the centre, M = [[xx, xy], [xy, yy]].
+
+    Parameters
+    ----------
+    xx, yy, xy : ndarray of shape (N,)
+
+    Returns
+    -------
+    major, minor : ndarray of shape (N,)
+        Square roots of the eigenvalues of M.
+    angle_deg : ndarray of shape (N,)
+        Angles of the major axes from +x towards +y, in [0, 180) degrees.
+    """
+    middle, spread = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
     major, minor = np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
-    angle_deg = np.degrees(np.arctan2(2 * xy, xx - yy) / 2) % 180.0
-    return dual[:, :2, 2], major, minor, angle_deg
+    return major, minor, np.degrees(arctan2(2 * xy, xx - yy) / 2) % 180.0
 
 
 def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
@@ -127,7 +144,7 @@ def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
 
 def _project_dual_conics(H_patch2image: Float) -> Float:
     """Return the images of the unit circle's dual conic under homographies, each divided by its last entry."""
-    dual = (H_patch2image * (1.0, 1.0, -1.0)) @ H_patch2image.transpose(0, 2, 1)
+    dual = matmul(H_patch2image * (1.0, 1.0, -1.0), H_patch2image.transpose(0, 2, 1))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan))
 

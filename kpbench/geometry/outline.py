@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kpbench.portable import cos_sin
 from kpbench.types import Float
 
 
@@ -74,7 +75,7 @@ Region = tuple[Contour, ...]
 def cos_sin_deg(angle_deg: float) -> tuple[float, float]:
     """Return the cosine and sine of an angle. Both are exact at multiples of 90 degrees."""
     quarter, rest = divmod(angle_deg, 90.0)
-    c, s = np.cos(np.radians(rest)), np.sin(np.radians(rest))
+    c, s = cos_sin(np.radians(rest))
     cosine, sine = ((c, s), (-s, c), (-c, -s), (s, -c))[int(quarter) % 4]
     return float(cosine), float(sine)
 
@@ -194,8 +195,8 @@ def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
     -------
     ndarray of shape (N, 2)
     """
-    raised = float(radius * np.sqrt(step / np.sin(step)))
-    return np.asarray(raised * np.column_stack([np.cos(angles), np.sin(angles)]))
+    raised = float(radius * np.sqrt(step / cos_sin(step)[1]))
+    return np.asarray(raised * np.column_stack(cos_sin(angles)))
 
 
 def _vertices(part: Line | Arc, tolerance: float) -> Float:

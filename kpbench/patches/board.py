@@ -211,7 +211,7 @@ class Board:
         parts, discs = [], []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
             # the tolerance is rounded down to a power of two, so that similar radii share an entry of the cache
-            black, disc = unit_polygons(k.patch, 2.0 ** np.floor(np.log2(1e-3 / radius)))
+            black, disc = unit_polygons(k.patch, float(np.ldexp(0.5, np.frexp(1e-3 / radius)[1])))
             parts.append([project(k.H_patch2board, polygon) for polygon in black])
             discs.append([project(k.H_patch2board, polygon) for polygon in disc])
         return parts, discs

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
+from kpbench.filters import filter_separably, gaussian_taps
 from kpbench.images import decode_photo
+from kpbench.portable import cos_sin
 from kpbench.types import Float, UInt8
 
 CACHE_BYTES = 128 * 2**20
@@ -26,6 +28,10 @@ LEAVES = 700
 of the image."""
 LEAF_RADIUS = (0.008, 0.35)
 """Smallest and largest radius of a shape in a procedural background, as fractions of the image's longer side."""
+LEAF_BLUR_PX = 0.7
+"""Standard deviation of the Gaussian that blurs the shapes of a procedural background, px."""
+TEXTURE_UNIT = 32
+"""Whole numbers per grey level in the texture of a procedural background. OpenCV interpolates whole numbers exactly."""
 TEXTURE_OCTAVES = 7
 """Number of noise layers in a procedural background. Each layer has half the resolution of the previous one."""
 
@@ -193,7 +199,7 @@ def _crop_and_resize(
     scale = zoom * min(columns / width_px, rows / height_px)
     w, h = max(1, round(width_px * scale)), max(1, round(height_px * scale))
     x, y = int(x_fraction * (columns - w + 1)), int(y_fraction * (rows - h + 1))
-    interpolation = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR
+    interpolation = cv2.INTER_AREA if scale > 1 else cv2.INTER_LINEAR_EXACT
     window = photo[y : y + h, x : x + w]
     return np.asarray(cv2.resize(window, (width_px, height_px), interpolation=interpolation), np.uint8)
 
@@ -240,29 +246,30 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
     rectangles = _place_polygon(np.sqrt(2) * _circle_corners(4, 45), centre_px, radius_px, ratio, angle_deg)
     for n, colour in enumerate(grey.tolist()):
         cv2.fillConvexPoly(canvas, (rectangles if is_rectangle[n] else ellipses)[n], colour, cv2.LINE_8, 4)
-    texture = _octave_noise(rng, width_px, height_px)
-    smooth = cv2.GaussianBlur(canvas, (0, 0), 0.7)
+    texture = _octave_noise(rng, width_px, height_px).astype(np.float32) / TEXTURE_UNIT
+    smooth = filter_separably(canvas, gaussian_taps(LEAF_BLUR_PX))
     if channels == 3:
         texture = cv2.merge([texture] * 3)
     return np.asarray(cv2.add(smooth, texture, dtype=cv2.CV_8U), np.uint8)
 
 
 def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
-    """Return the sum of all octaves of smooth noise: ndarray of shape (height_px, width_px), float32, grey levels."""
+    """Return the sum of all octaves of smooth noise: ndarray of shape (height_px, width_px), int16, ``TEXTURE_UNIT``."""
     strength = rng.uniform(2, 14)
     sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
     octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
-    texture: Any = np.zeros((2, 2), np.float32)
+    texture: Any = np.zeros((2, 2), np.int16)
     for octave in range(TEXTURE_OCTAVES, 0, -1):  # from coarse to fine
-        texture = cv2.resize(texture, sizes[octave - 1])
-        texture += np.float32(strength * 2 ** (octave / 2 - 2)) * octaves[octave - 1]
-    return cv2.resize(texture, (width_px, height_px))
+        texture = cv2.resize(texture, sizes[octave - 1], interpolation=cv2.INTER_LINEAR_EXACT)
+        gain = np.float32(TEXTURE_UNIT * strength * np.sqrt(2.0) ** octave / 4)
+        texture += np.rint(gain * octaves[octave - 1]).astype(np.int16)
+    return cv2.resize(texture, (width_px, height_px), interpolation=cv2.INTER_LINEAR_EXACT)
 
 
 def _circle_corners(count: int, start_deg: float = 0.0) -> Float:
     """Return the corners of a regular polygon on the unit circle: ndarray of shape (count, 2)."""
     angles = np.radians(start_deg) + np.arange(count) * (2 * np.pi / count)
-    return np.column_stack([np.cos(angles), np.sin(angles)])
+    return np.column_stack(cos_sin(angles))
 
 
 def _place_polygon(
@@ -282,7 +289,7 @@ def _place_polygon(
     ndarray of shape (n, k, 2), int32
         Corners in 1/16 px, the unit of OpenCV's drawing functions.
     """
-    c, s = np.cos(np.radians(angle_deg))[:, None], np.sin(np.radians(angle_deg))[:, None]
+    c, s = (v[:, None] for v in cos_sin(np.radians(angle_deg)))
     u, v = corners[:, 0] * radius_px[:, None], corners[:, 1] * (radius_px * ratio)[:, None]
     points = np.stack([c * u - s * v, s * u + c * v], axis=-1) + centre_px[:, None]
     return np.rint(points * 16).astype(np.int32)

@@ -15,6 +15,7 @@ from kpbench.errors import DataError
 from kpbench.geometry.camera import NO_DISTORTION, Camera, plane_to_camera, rotation_xyz
 from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import BoardLike
+from kpbench.portable import exp, log, matmul
 from kpbench.types import Float
 
 FREE_MARGIN = 0.01
@@ -56,12 +57,12 @@ class Pose:
 def polygon_area(points: Float) -> float:
     """Compute the area of a simple polygon with vertices of shape (n, 2), clockwise or counter-clockwise."""
     x, y = (points - points[0]).T
-    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
+    return float(abs((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()) / 2)
 
 
 def project_to_image(camera: Camera, pose: Pose, points_mm: Float) -> Float:
     """Return the pixel coordinates, shape (n, 2), of points on the board, shape (n, 2), mm."""
-    return camera.project(np.column_stack([points_mm, np.ones(len(points_mm))]) @ pose.M_board2camera.T)
+    return camera.project(matmul(np.column_stack([points_mm, np.ones(len(points_mm))]), pose.M_board2camera.T))
 
 
 def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: float = 0.0) -> Float:
@@ -77,7 +78,7 @@ def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm
     end_px = project_to_image(camera, pose, np.roll(polygon_mm, -1, axis=0))
-    length_px = np.linalg.norm(end_px - project_to_image(camera, pose, polygon_mm), axis=1)
+    length_px = np.sqrt(((end_px - project_to_image(camera, pose, polygon_mm)) ** 2).sum(axis=1))
     pieces = np.clip(np.ceil(length_px / LONGEST_PIECE_PX), 1, MOST_PIECES).astype(int)
     edge = np.repeat(np.arange(len(pieces)), pieces)
     fraction = (np.arange(len(edge)) - np.repeat(np.cumsum(pieces) - pieces, pieces)) / pieces[edge]
@@ -136,7 +137,7 @@ def pose_board(
     """
     # in rotation_xyz, a positive x angle turns +y (down) away from the camera, and a positive y angle turns +x towards
     # the camera; pitch and yaw have the opposite signs
-    R = rotation_xyz(0, -yaw_deg, 0) @ rotation_xyz(-pitch_deg, 0, 0) @ rotation_xyz(0, 0, roll_deg)
+    R = matmul(matmul(rotation_xyz(0, -yaw_deg, 0), rotation_xyz(-pitch_deg, 0, 0)), rotation_xyz(0, 0, roll_deg))
     size = np.array([camera.width_px, camera.height_px])
     margin_px = FREE_MARGIN * camera.width_px
     for fraction in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
@@ -154,14 +155,14 @@ def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px:
 
     def solve(lens: Camera, nearest_mm: float, farthest_mm: float) -> float:
         def log_area_ratio(log_depth: float) -> float:
-            outline = project_outline(lens, Pose(R, np.exp(log_depth) * ray), board)
-            return float(np.log(polygon_area(outline) / area_px))
+            outline = project_outline(lens, Pose(R, exp(log_depth) * ray), board)
+            return float(log(polygon_area(outline) / area_px))
 
-        return float(np.exp(brentq(log_area_ratio, np.log(nearest_mm), np.log(farthest_mm), xtol=1e-13)))
+        return float(exp(brentq(log_area_ratio, float(log(nearest_mm)), float(log(farthest_mm)), xtol=1e-13)))
 
     corners = np.array([(x, y, 0.0) for x in (-0.5, 0.5) for y in (-0.5, 0.5)]) * (board.side_x_mm, board.side_y_mm, 0)
     frontal_mm = camera.focal_px * np.sqrt(board.side_x_mm * board.side_y_mm / area_px)
-    nearest_mm = max(-(corners @ R.T)[:, 2].min() * 1.001, 0.05 * frontal_mm)
+    nearest_mm = max(-matmul(corners, R.T)[:, 2].min() * 1.001, 0.05 * frontal_mm)
     try:
         depth_mm = solve(replace(camera, distortion=NO_DISTORTION), nearest_mm, 4 * frontal_mm)
         if not any(camera.distortion):

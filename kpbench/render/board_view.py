@@ -13,10 +13,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.filters import filter_separably, gaussian_taps
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
-from kpbench.geometry.homography import Ellipse, project_disc
+from kpbench.geometry.homography import Ellipse, ellipse_axes, project_disc
 from kpbench.patches.board import BoardLike
+from kpbench.portable import cos_sin, matmul
 from kpbench.render.board_projection import Pose, polygon_area, project_outline, project_polygon, project_to_image
 from kpbench.render.scene import Mask, Rendering, measure_contrast
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
@@ -97,9 +99,9 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
     """
     keypoints = np.zeros(len(board.keypoints), KEYPOINT_DTYPE)
     for n, k in enumerate(board.keypoints):
-        M_patch2camera = pose.M_board2camera @ k.H_patch2board
+        M_patch2camera = matmul(pose.M_board2camera, k.H_patch2board)
         ray = M_patch2camera[:2, 2] / M_patch2camera[2, 2]
-        H = camera.local_K(ray) @ M_patch2camera
+        H = matmul(camera.local_K(ray), M_patch2camera)
         H /= H[2, 2]
         x, y = camera.distort(ray[None])[0]
         is_bent = any(camera.distortion)
@@ -112,8 +114,8 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
 def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
     """Return the pixel coordinates, shape (RIM_POINTS, 2), of evenly spaced points on the patch's unit circle."""
     angles = np.arange(RIM_POINTS) * (2 * np.pi / RIM_POINTS)
-    rim = np.column_stack([np.cos(angles), np.sin(angles), np.ones(RIM_POINTS)])
-    return camera.project(rim @ M_patch2camera.T)
+    rim = np.column_stack([*cos_sin(angles), np.ones(RIM_POINTS)])
+    return camera.project(matmul(rim, M_patch2camera.T))
 
 
 def _ellipse_of_moments(points: Float) -> Ellipse:
@@ -125,14 +127,16 @@ def _ellipse_of_moments(points: Float) -> Ellipse:
     a, b = points - middle, np.roll(points, -1, axis=0) - middle
     cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
     area = cross.sum() / 2
-    centroid = cross @ (a + b) / (6 * area)
-    square = (np.einsum("n,ni,nj->ij", cross, a, a) + np.einsum("n,ni,nj->ij", cross, b, b)) / 12
-    mixed = np.einsum("n,ni,nj->ij", cross, a, b) / 24
-    values, vectors = np.linalg.eigh((square + mixed + mixed.T) / area - np.outer(centroid, centroid))
-    minor, major = 2 * np.sqrt(values)
-    angle_deg = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])) % 180)
+    centroid = (cross[:, None] * (a + b)).sum(axis=0) / (6 * area)
+
+    def second_moment(i: int, j: int) -> Float:
+        """Return four times the central moment, which for an ellipse is the entry of the matrix of its axes."""
+        corners = a[:, i] * a[:, j] + b[:, i] * b[:, j] + (a[:, i] * b[:, j] + b[:, i] * a[:, j]) / 2
+        return np.asarray(4 * ((cross * corners).sum() / (12 * area) - centroid[i] * centroid[j]))
+
+    major, minor, angle_deg = ellipse_axes(second_moment(0, 0), second_moment(1, 1), second_moment(0, 1))
     x, y = middle + centroid
-    return Ellipse(float(x), float(y), float(major), float(minor), angle_deg)
+    return Ellipse(float(x), float(y), float(major), float(minor), float(angle_deg))
 
 
 def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike, appearance: Appearance) -> Rendering:
@@ -251,8 +255,10 @@ def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Ap
     x, y, w, h = bounding_box([outline])
     margin = int(np.ceil(3 * blur))
     box = (x - margin, y - margin, w + 2 * margin, h + 2 * margin)
-    coarse = cv2.GaussianBlur(rasterise([[outline]], [box])[0].astype(np.float32), (0, 0), blur)
-    fine = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR)
+    # OpenCV interpolates whole numbers exactly on every processor
+    cover = np.rint(255 * rasterise([[outline]], [box])[0]).astype(np.uint8)
+    coarse = filter_separably(cover, gaussian_taps(blur))
+    fine = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR_EXACT)
     in_image, in_box = clip_to_image((box[0] * step, box[1] * step, fine.shape[1], fine.shape[0]), image)
-    light = 1 - np.float32(appearance.shadow) * fine[in_box]
+    light = 1 - np.float32(appearance.shadow / 255) * fine[in_box]
     image[in_image] = np.rint(image[in_image] * (light if image.ndim == 2 else light[..., None])).astype(np.uint8)

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from kpbench.patches.design import Patch, unit_polygons
+from kpbench.portable import cos_sin, exp, log, matmul
 from kpbench.types import Float, UInt8
 
 
@@ -77,7 +78,7 @@ def draw_lookalikes(
         dark, light = float(rng.uniform(0, 120)), float(rng.uniform(150, 255))
         ink, second_ink = (dark, light) if rng.random() < 0.5 else (light, dark)
         x, y = rng.uniform(0, 1, 2) * (width, height)
-        radius = float(np.exp(rng.uniform(*np.log(radius_px))))
+        radius = float(exp(rng.uniform(*log(radius_px))))
         ratio, angle_deg = float(rng.uniform(0.4, 1)), float(rng.uniform(0, 360))
         lookalike = Lookalike(float(x), float(y), radius, ratio, angle_deg, ink, second_ink)
         kind = int(rng.integers(len(DRAWERS) + 1))
@@ -122,9 +123,7 @@ def _draw_half_disc(image: UInt8, rng: np.random.Generator, lookalike: Lookalike
 def _draw_polygon(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a triangle or a quadrangle."""
     angles = np.sort(rng.uniform(0, 2 * np.pi, int(rng.integers(3, 5))))
-    corners = np.column_stack(
-        [lookalike.x + lookalike.radius * np.cos(angles), lookalike.y + lookalike.radius * np.sin(angles)]
-    )
+    corners = (lookalike.x, lookalike.y) + lookalike.radius * np.column_stack(cos_sin(angles))
     cv2.fillPoly(image, [_to_sixteenths(corners)], _colour(image, lookalike.ink), cv2.LINE_AA, 4)
 
 
@@ -137,8 +136,7 @@ def _draw_text(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> 
 
 def _draw_bar(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a bar or a line, six radii long."""
-    angle = np.radians(lookalike.angle_deg)
-    half = 3 * lookalike.radius * np.array([np.cos(angle), np.sin(angle)])
+    half = 3 * lookalike.radius * np.array(cos_sin(np.radians(lookalike.angle_deg)))
     start, end = ((round(lookalike.x + sign * half[0]), round(lookalike.y + sign * half[1])) for sign in (-1, 1))
     cv2.line(image, start, end, _colour(image, lookalike.ink), int(rng.integers(1, 8)), cv2.LINE_AA)
 
@@ -147,11 +145,11 @@ def _draw_chequers(image: UInt8, rng: np.random.Generator, lookalike: Lookalike)
     """Draw a chequer board. Each inner corner looks like the patch ``checker``, but is next to other squares."""
     rows, columns = (int(v) for v in rng.integers(3, 8, 2))
     side = min(lookalike.radius, 18.0)
-    A = _rotation(lookalike.angle_deg) @ np.diag([side, side * max(lookalike.ratio, 0.5)])
+    A = _rotation(lookalike.angle_deg) * (side, side * max(lookalike.ratio, 0.5))
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) - (columns / 2, rows / 2)
     for i in range(rows):
         for j in range(columns):
-            square = _to_sixteenths((corners + np.array([j, i])) @ A.T + (lookalike.x, lookalike.y))
+            square = _to_sixteenths(matmul(corners + np.array([j, i]), A.T) + np.array([lookalike.x, lookalike.y]))
             level = (lookalike.ink, lookalike.second_ink)[(i + j) % 2]
             cv2.fillConvexPoly(image, square, _colour(image, level), cv2.LINE_8, 4)
 
@@ -161,17 +159,18 @@ def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalik
     black, disc = unit_polygons(patch, 2.0**-8)
     cut = float(rng.uniform(0.15, 0.4))  # distance from the centre to the cut, in radii
     spin = _rotation(float(rng.uniform(0, 360)))
-    A = _rotation(lookalike.angle_deg) @ np.diag([1, lookalike.ratio]) * lookalike.radius
+    A = _rotation(lookalike.angle_deg) * (lookalike.radius, lookalike.radius * lookalike.ratio)
     light, dark = max(lookalike.ink, lookalike.second_ink), min(lookalike.ink, lookalike.second_ink)
     for polygons, level in ((disc, light), (black, dark)):
         # vertices of the other part move onto the cut: this part of the polygon then has no area
-        kept = [np.maximum(polygon @ spin.T, (cut, -np.inf)) @ A.T + (lookalike.x, lookalike.y) for polygon in polygons]
+        parts = [np.maximum(matmul(polygon, spin.T), (cut, -np.inf)) for polygon in polygons]
+        kept = [matmul(part, A.T) + np.array([lookalike.x, lookalike.y]) for part in parts]
         cv2.fillPoly(image, [_to_sixteenths(points) for points in kept], _colour(image, level), cv2.LINE_8, 4)
 
 
 def _rotation(angle_deg: float) -> Float:
     """Return the matrix (2, 2) of a rotation from +x towards +y."""
-    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    c, s = map(float, cos_sin(np.radians(angle_deg)))
     return np.array([[c, -s], [s, c]])
 
 

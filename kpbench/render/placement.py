@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.geometry.homography import project_discs
 from kpbench.patches.design import Patch
+from kpbench.portable import cos_sin, exp, log
 from kpbench.types import Float
 
 GAP_PX = 2.0
@@ -170,7 +172,7 @@ def random_placements(
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
             # the image of a steeply tilted patch is no ellipse if its rim reaches the horizon
             has_ellipse = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
-            is_free = all(math.hypot(x - x0, y - y0) > r + r0 + GAP_PX for x0, y0, r0 in circles)
+            is_free = all((x - x0) ** 2 + (y - y0) ** 2 > (r + r0 + GAP_PX) ** 2 for x0, y0, r0 in circles)
             if len(placements) < count and has_ellipse and is_free:
                 circles.append((x, y, r))
                 placements.append(Placement(patches[chosen[n]], poses[n], float(black[n]), float(white[n])))
@@ -212,7 +214,7 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
         H[:, 0, 2], H[:, 1, 2], H[:, 2, 2] = x, y, 1.0
         _, major, minor, _ = project_discs(H)
         keeps_limits = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
-        depth_change = np.hypot(H[:, 2, 0], H[:, 2, 1])
+        depth_change = np.sqrt(H[:, 2, 0] ** 2 + H[:, 2, 1] ** 2)
         accepted.append(H[keeps_limits & (depth_change <= LARGEST_DEPTH_CHANGE)][:missing])
         missing -= len(accepted[-1])
     return np.concatenate(accepted)
@@ -225,7 +227,7 @@ def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, 
     are columns of a rotation matrix as in :func:`kpbench.geometry.camera.rotation_xyz`: by ``turn`` about z, then by
     ``tilt[1]`` about y, then by ``tilt[0]`` about x. The angles are in rad. (cx_px, cy_px) is the principal point.
     """
-    (cx, cy), (sx, sy), cz, sz = np.cos(tilt), np.sin(tilt), np.cos(turn), np.sin(turn)
+    (cx, cy, cz), (sx, sy, sz) = cos_sin(np.vstack([tilt, turn]))
     H = np.empty((len(turn), 3, 3))
     H[:, 0, 0], H[:, 0, 1] = radius_px * cy * cz, -radius_px * cy * sz
     H[:, 1, 0], H[:, 1, 1] = radius_px * (cx * sz + sx * sy * cz), radius_px * (cx * cz - sx * sy * sz)
@@ -237,4 +239,9 @@ def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, 
 
 
 def _draw_log_uniform(rng: np.random.Generator, bounds: tuple[float, float], count: int) -> Float:
-    return np.exp(rng.uniform(np.log(bounds[0]), np.log(bounds[1]), count))
+    return exp(rng.uniform(*_log(bounds), count))
+
+
+@cache
+def _log(bounds: tuple[float, float]) -> tuple[float, float]:
+    return float(log(bounds[0])), float(log(bounds[1]))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise_edges
 from kpbench.geometry.homography import project_discs
 from kpbench.patches.design import Patch, unit_polygons
+from kpbench.portable import matmul
 from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
@@ -107,11 +108,11 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
     poses = np.stack([p.H_patch2image for p in placements])
     _, major, _, _ = project_discs(poses)
     # the tolerances are rounded down to powers of two, so that patches of similar size share cached polygons
-    tolerances = 2.0 ** np.floor(np.log2(tolerance_px / major))
+    tolerances = np.ldexp(0.5, np.frexp(tolerance_px / major)[1])
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     for p, tolerance in zip(placements, tolerances, strict=True):
         vertices, next_vertex, black_count, disc_count = _unit_edges(p.patch, float(tolerance))
-        mapped = p.H_patch2image @ vertices
+        mapped = matmul(p.H_patch2image, vertices)
         points = mapped[:2] / mapped[2]
         starts.append(points)
         ends.append(points[:, next_vertex])

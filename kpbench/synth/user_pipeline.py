@@ -22,7 +22,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.degrade.weather import import_albumentations
 from kpbench.errors import DataError
 from kpbench.files import read_text
 from kpbench.geometry.homography import project
@@ -43,6 +42,18 @@ PIPELINE_SECONDS = 5
 """Processor time that a pipeline may take for two images of up to a megapixel, s; more for larger images."""
 LONGEST_SCALAR = 1000
 """Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
+
+
+def _import_albumentations() -> Any:
+    """Import albumentations and return the module.
+
+    The import is slow and is therefore made at the first use. ``NO_ALBUMENTATIONS_UPDATE`` stops albumentations from
+    looking online for a newer version.
+    """
+    os.environ["NO_ALBUMENTATIONS_UPDATE"] = "1"
+    import albumentations
+
+    return albumentations
 
 
 def load_augmentation(path: str | Path) -> str:
@@ -100,7 +111,7 @@ def _parse_yaml(text: str) -> Any:
 
 @lru_cache(maxsize=4)
 def _build_pipeline(canonical: str) -> Any:
-    library = import_albumentations()
+    library = _import_albumentations()
     pipeline = library.Compose([library.from_dict(json.loads(canonical))])
     _interpolate_masks(pipeline)
     return pipeline

@@ -5,8 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from kpbench.degrade.blurs import BORDER_MODE, box_taps, line_kernel
+from kpbench.degrade.blurs import box_taps, line_kernel
 from kpbench.degrade.effects import jpeg
+from kpbench.filters import BORDER_MODE
 from kpbench.types import Float32, UInt8
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from kpbench.degrade.blurs import blur, box_taps, disc_kernel, gaussian_taps, line_kernel
+from kpbench.degrade.blurs import blur, box_taps, disc_kernel, line_kernel
 from kpbench.degrade.effects import (
     flare,
     low_light,
@@ -17,6 +17,7 @@ from kpbench.degrade.effects import (
 )
 from kpbench.degrade.ladder import EFFECT_FUNCTIONS, LADDER, apply_effects, draw_effect
 from kpbench.errors import DataError
+from kpbench.filters import gaussian_taps
 from kpbench.geometry.coverage import rasterise
 
 RUNGS = [(effect, level) for effect, severity in LADDER.items() for level in severity.levels]
