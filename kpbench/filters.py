@@ -7,6 +7,8 @@ border, the image continues as its mirror image about the outermost pixel.
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from scipy import fft
@@ -76,7 +78,7 @@ def filter_separably(image: UInt8, taps: Float) -> UInt8:
     if len(taps) > MOST_DIRECT_WEIGHTS:
         return filter_image(image, np.outer(taps, taps))
     weights = to_whole_weights(taps, SEPARABLE_UNIT).astype(np.float32)
-    rows = cv2.filter2D(image.astype(np.float32), -1, weights[None], borderType=BORDER_MODE)
+    rows: Any = cv2.filter2D(image.astype(np.float32), -1, weights[None], borderType=BORDER_MODE)
     rows *= np.float32(16 / SEPARABLE_UNIT)
     sums = cv2.filter2D(np.rint(rows, out=rows), -1, weights[:, None], borderType=BORDER_MODE)
     return _divide(sums, 16 * SEPARABLE_UNIT)
@@ -103,7 +105,7 @@ def box_filter(image: UInt8, side_px: int) -> UInt8:
     return _divide(sums, side_px**2)
 
 
-def _divide(sums: np.ndarray[tuple[int, ...], np.dtype[np.float32]], unit: int) -> UInt8:
+def _divide(sums: Any, unit: int) -> UInt8:
     """Divide by a whole number and round half to even. The fused steps of some processors change nothing here."""
     return np.asarray(cv2.convertScaleAbs(sums, alpha=1 / unit), np.uint8)
 

@@ -115,10 +115,9 @@ def arctan2(y: ArrayLike, x: ArrayLike) -> Float:
     run, rise = np.abs(x), np.abs(y)
     is_steep = rise > run
     run, rise = np.where(is_steep, rise, run), np.where(is_steep, run, rise)
-    # two halvings of the angle from at most pi/4 to at most pi/16, where the series is short
-    for _ in range(2):
-        run = run + np.sqrt(run * run + rise * rise)
-    ratio = np.divide(rise, run, out=np.zeros(np.shape(run)), where=run > 0)
+    ratio = np.divide(rise, run, out=np.zeros(np.broadcast(rise, run).shape), where=run > 0)
+    for _ in range(2):  # halves the angle, from at most pi/4 to at most pi/16, where the series is short
+        ratio = ratio / (1 + np.sqrt(1 + ratio * ratio))
     angle = 4 * (ratio + ratio * _polynomial(_ARCTAN, ratio * ratio))
     angle = np.where(is_steep, math.pi / 2 - angle, angle)
     angle = np.where(x < 0, math.pi - angle, angle)

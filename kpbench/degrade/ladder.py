@@ -99,9 +99,8 @@ def _draw_rainfall(rng: np.random.Generator, level: float, size_px: tuple[int, i
 def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
     """Draw one strip per patch that covers ``level`` percent of the patch's disc from a random side."""
     border = np.linspace(1, -1, 2001)
-    hidden = (
-        arctan2(np.sqrt(1 - border**2), border) - border * np.sqrt(1 - border**2)
-    ) / np.pi  # share of a unit disc beyond x = border
+    rise = np.sqrt(1 - border**2)
+    hidden = (arctan2(rise, border) - border * rise) / np.pi  # share of a unit disc beyond x = border
     start = float(np.interp(level / 100, hidden, border))
     end = 1.3  # far end of the strip, radii from the patch's centre: beyond the disc
     strips = []

@@ -1,7 +1,8 @@
 """Shadow and rain: :func:`shadow` and :func:`rain` of the paper, and :func:`rainfall` with a strength.
 
-The paper took its two from the library albumentations. The random numbers here have the distributions of that library's
-``RandomShadow`` and ``RandomRain`` (version 2.0.8, their default arguments), so that the images have the same statistics.
+The paper took its two from the library albumentations. The random numbers here have the distributions of
+``RandomShadow`` and ``RandomRain`` of that library (version 2.0.8, default arguments). The images therefore have the
+same statistics.
 """
 
 from __future__ import annotations

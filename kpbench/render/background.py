@@ -254,7 +254,10 @@ def procedural_background(rng: np.random.Generator, width_px: int, height_px: in
 
 
 def _octave_noise(rng: np.random.Generator, width_px: int, height_px: int) -> Any:
-    """Return the sum of all octaves of smooth noise: ndarray of shape (height_px, width_px), int16, ``TEXTURE_UNIT``."""
+    """Return the sum of all octaves of smooth noise, ndarray of shape (height_px, width_px), int16.
+
+    The unit is 1 / ``TEXTURE_UNIT`` grey level.
+    """
     strength = rng.uniform(2, 14)
     sizes = [(max(2, width_px >> octave), max(2, height_px >> octave)) for octave in range(1, TEXTURE_OCTAVES + 1)]
     octaves = [rng.standard_normal(size[::-1], dtype=np.float32) for size in sizes]
