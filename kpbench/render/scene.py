@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise_edges
 from kpbench.geometry.homography import project_discs
 from kpbench.patches.design import Patch, unit_polygons
-from kpbench.portable import matmul
 from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
 
@@ -74,8 +73,8 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
 
     Returns
     -------
-    vertices : ndarray of shape (3, N)
-        Homogeneous coordinates; first the vertices of the black areas, then the vertices of the disc.
+    vertices : ndarray of shape (2, N)
+        First the vertices of the black areas, then the vertices of the disc.
     next_vertex : ndarray of shape (N,)
         Index of the next vertex of the same polygon. An edge leads from each vertex to its next vertex.
     black_count, disc_count : int
@@ -86,7 +85,7 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
     next_vertex = np.concatenate([np.roll(np.arange(n), -1) + sum(sizes[:k]) for k, n in enumerate(sizes)])
     points = np.concatenate([*black, *disc])
     black_count = sum(map(len, black))
-    return np.vstack([points.T, np.ones(len(points))]), next_vertex, black_count, len(points) - black_count
+    return np.ascontiguousarray(points.T), next_vertex, black_count, len(points) - black_count
 
 
 def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> list[Mask]:
@@ -111,11 +110,12 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
     tolerances = np.ldexp(0.5, np.frexp(tolerance_px / major)[1])
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     for p, tolerance in zip(placements, tolerances, strict=True):
-        vertices, next_vertex, black_count, disc_count = _unit_edges(p.patch, float(tolerance))
-        mapped = matmul(p.H_patch2image, vertices)
+        (u, v), next_vertex, black_count, disc_count = _unit_edges(p.patch, float(tolerance))
+        H = p.H_patch2image
+        mapped = H[:, :1] * u + H[:, 1:2] * v + H[:, 2:]
         points = mapped[:2] / mapped[2]
         starts.append(points)
-        ends.append(points[:, next_vertex])
+        ends.append(points.take(next_vertex, axis=1))
         counts += [black_count, disc_count]
         boxes += [bounding_box([points[:, black_count:].T])] * 2
     owner = np.repeat(np.arange(len(counts)), counts)
