@@ -97,10 +97,26 @@ def project_discs(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
     >>> centre.tolist(), major.tolist(), minor.tolist(), angle_deg.tolist()
     ([[100.0, 50.0]], [20.0], [10.0], [0.0])
     """
+    centre, xx, yy, xy = _project_axes(H_patch2image)
+    return centre, *ellipse_axes(xx, yy, xy)
+
+
+def project_disc_sizes(H_patch2image: Float) -> tuple[Float, Float, Float]:
+    """Return the centres and the semi-axes of the ellipses of :func:`project_discs`, without their angles."""
+    centre, xx, yy, xy = _project_axes(H_patch2image)
+    return centre, *_semi_axes(xx, yy, xy)
+
+
+def _project_axes(H_patch2image: Float) -> tuple[Float, Float, Float, Float]:
+    """Return the centres of the ellipses, and the entries of the matrices for :func:`ellipse_axes`."""
     dual = _project_dual_conics(H_patch2image)
     x, y = dual[:, 0, 2], dual[:, 1, 2]
-    xx, yy, xy = x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
-    return dual[:, :2, 2], *ellipse_axes(xx, yy, xy)
+    return dual[:, :2, 2], x * x - dual[:, 0, 0], y * y - dual[:, 1, 1], x * y - dual[:, 0, 1]
+
+
+def _semi_axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float]:
+    middle, spread = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    return np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
 
 
 def ellipse_axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
@@ -117,9 +133,7 @@ def ellipse_axes(xx: Float, yy: Float, xy: Float) -> tuple[Float, Float, Float]:
     angle_deg : ndarray of shape (N,)
         Angles of the major axes from +x towards +y, in [0, 180) degrees.
     """
-    middle, spread = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-    major, minor = np.sqrt(middle + spread), np.sqrt(np.maximum(middle - spread, 0.0))
-    return major, minor, np.degrees(arctan2(2 * xy, xx - yy) / 2) % 180.0
+    return *_semi_axes(xx, yy, xy), np.degrees(arctan2(2 * xy, xx - yy) / 2) % 180.0
 
 
 def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 
 from kpbench.errors import DataError
-from kpbench.geometry.homography import project_discs
+from kpbench.geometry.homography import project_disc_sizes
 from kpbench.patches.design import Patch
 from kpbench.portable import cos_sin, exp, log
 from kpbench.types import Float
@@ -168,7 +168,7 @@ def random_placements(
         black, white = rng.uniform(*limits.black, candidates), rng.uniform(*limits.white, candidates)
         extent = np.array([patch.extent for patch in patches])[chosen]
         H_extent2image = poses * np.stack([extent, extent, np.ones(candidates)], axis=1)[:, None]
-        centre, reach, _, _ = project_discs(H_extent2image)
+        centre, reach, _ = project_disc_sizes(H_extent2image)
         for n, (x, y, r) in enumerate(np.column_stack([centre, reach]).tolist()):
             # the image of a steeply tilted patch is no ellipse if its rim reaches the horizon
             has_ellipse = math.isfinite(r) and math.isfinite(x) and math.isfinite(y)
@@ -205,14 +205,13 @@ def random_poses(rng: np.random.Generator, count: int, width_px: int, height_px:
     missing = count
     while missing > 0:
         n = 2 * missing + 4
-        focal_px = width_px * _draw_log_uniform(rng, limits.focal, n)
-        radius_px = _draw_log_uniform(rng, limits.radius_px, n)
+        focal, radius_px = exp(np.stack([rng.uniform(*_log(span), n) for span in (limits.focal, limits.radius_px)]))
         tilt = np.radians(rng.uniform(-limits.tilt_deg, limits.tilt_deg, (2, n)))
         turn = rng.uniform(0, 2 * np.pi, n)
         x, y = rng.uniform(0, 1, (2, n)) * np.array([[width_px - 1], [height_px - 1]])
-        H = _pose_matrices(focal_px, radius_px, tilt, turn, (width_px - 1) / 2, (height_px - 1) / 2)
+        H = _pose_matrices(width_px * focal, radius_px, tilt, turn, (width_px - 1) / 2, (height_px - 1) / 2)
         H[:, 0, 2], H[:, 1, 2], H[:, 2, 2] = x, y, 1.0
-        _, major, minor, _ = project_discs(H)
+        _, major, minor = project_disc_sizes(H)
         keeps_limits = (2 * minor >= limits.minor_axis_px) & (major - minor <= limits.axis_difference * major)
         depth_change = np.sqrt(H[:, 2, 0] ** 2 + H[:, 2, 1] ** 2)
         accepted.append(H[keeps_limits & (depth_change <= LARGEST_DEPTH_CHANGE)][:missing])
@@ -236,10 +235,6 @@ def _pose_matrices(focal_px: Float, radius_px: Float, tilt: Float, turn: Float, 
     H[:, 0, :2] += cx_px * H[:, 2, :2]
     H[:, 1, :2] += cy_px * H[:, 2, :2]
     return H
-
-
-def _draw_log_uniform(rng: np.random.Generator, bounds: tuple[float, float], count: int) -> Float:
-    return exp(rng.uniform(*_log(bounds), count))
 
 
 @cache

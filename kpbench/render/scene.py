@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise_edges
-from kpbench.geometry.homography import project_discs
+from kpbench.geometry.homography import project_disc_sizes, project_discs
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
@@ -105,7 +105,7 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
     if not placements:
         return []
     poses = np.stack([p.H_patch2image for p in placements])
-    _, major, _, _ = project_discs(poses)
+    _, major, _ = project_disc_sizes(poses)
     # the tolerances are rounded down to powers of two, so that patches of similar size share cached polygons
     tolerances = np.ldexp(0.5, np.frexp(tolerance_px / major)[1])
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from kpbench.geometry.homography import project_discs
+from kpbench.geometry.homography import project_disc_sizes
 from kpbench.images import resize
 from kpbench.patches.design import Patch
 from kpbench.render.lookalikes import draw_lookalikes
@@ -172,7 +172,7 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         poses = first @ steps @ turns
         poses = poses[poses[:, 2, 2] > 0.2]
         poses /= poses[:, 2:, 2:]
-    centres, majors, minors, _ = project_discs(poses)
+    centres, majors, minors = project_disc_sizes(poses)
     one_design = rng.random() < 0.5
     design = rng.integers(len(patches), size=len(poses))
     black = rng.uniform(*limits.black, len(poses))
