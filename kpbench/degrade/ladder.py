@@ -212,7 +212,7 @@ def draw_paper_mix(rng: np.random.Generator) -> list[Effect]:
         "shadow": {"seed": _draw_seed(rng)},
         "rain": {"seed": _draw_seed(rng)},
         "motion_blur": {"length_px": int(rng.integers(3, 10)), "angle_deg": int(rng.integers(180))},
-        "blur": {"kernel_px": int(rng.choice([3, 5, 7]))},
+        "blur": {"kernel_px": (3, 5, 7)[int(rng.integers(3))]},
         "brightness": {"factor": round(rng.uniform(0.5, 1.3), 3)},
         "noise": {"sigma": round(rng.uniform(5, 30), 2)},
     }

@@ -159,8 +159,8 @@ def project_disc_boxes(H_patch2image: Float) -> tuple[Float, Float]:
 def _project_dual_conics(H_patch2image: Float) -> Float:
     """Return the images of the unit circle's dual conic under homographies, each divided by its last entry."""
     dual = matmul(H_patch2image * (1.0, 1.0, -1.0), H_patch2image.transpose(0, 2, 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(np.where(dual[:, 2:, 2:] < 0, dual / dual[:, 2:, 2:], np.nan))
+    last = dual[:, 2:, 2:]
+    return np.asarray(np.divide(dual, last, out=np.full(dual.shape, np.nan), where=last < 0))
 
 
 def project_disc(H_patch2image: Float) -> Ellipse:
