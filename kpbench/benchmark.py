@@ -309,8 +309,8 @@ def _detect_part(part: _Part, progress: Progress) -> None:
     ids = [int(dataset.truth.image_id[n]) for n in images]
     failures = [[image_id, found[n][1]] for n, image_id in zip(images, ids, strict=True) if found[n][1]]
     detections, description = [found[n][0] for n in images], part.description | _describe_failures(failures)
-    fingerprint = dataset.fingerprint
-    predictions = Predictions.from_detections(detections, ids, description, str(dataset.path), fingerprint)
+    digests = dataset.fingerprint, dataset.truth.digest
+    predictions = Predictions.from_detections(detections, ids, description, str(dataset.path), *digests)
     write_predictions(part.file, predictions)
 
 
@@ -332,7 +332,8 @@ def _join_parts(planned: Sequence[_Part], file: Path) -> None:
     description = parts[0].detector | _describe_failures(failures)
     found = [detections for part in parts for detections in part.detections()]
     ids = np.concatenate([part.image_id for part in parts])
-    predictions = Predictions.from_detections(found, ids, description, parts[0].dataset, parts[0].fingerprint)
+    of_dataset = parts[0].dataset, parts[0].fingerprint, parts[0].truth_digest
+    predictions = Predictions.from_detections(found, ids, description, *of_dataset)
     write_predictions(file, predictions)
     _remove_parts(planned)
 

@@ -25,6 +25,13 @@ def opencv_version() -> str:
     return str(cv2.__version__)
 
 
+def processor_features() -> str:
+    """Return the instructions of the processor that OpenCV uses."""
+    import cv2
+
+    return str(cv2.getCPUFeaturesLine())
+
+
 def warn_of_opencv() -> None:
     """Warn if OpenCV is not of the tested major version, or if packages of several versions are installed."""
     installed = {}

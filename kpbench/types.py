@@ -8,6 +8,7 @@ Coordinates are px. The centre of the top-left pixel is (0, 0), x points right a
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -123,6 +124,8 @@ class Truth:
         Images of one base scene share this number. The bootstrap draws whole scenes.
     fingerprint : str
         Fingerprint of the dataset; "" for none.
+    recipe : str
+        SHA-256 of the dataset's config without the software that made the pixels; "" for none.
 
     Examples
     --------
@@ -141,9 +144,28 @@ class Truth:
     rung: Float
     scene_id: NDArray[np.int64]
     fingerprint: str = ""
+    recipe: str = ""
 
     def __len__(self) -> int:
         return len(self.image_id)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 over ``recipe`` and all columns but ``contrast``, which is measured in the pixels; "" without recipe.
+
+        Datasets of one digest show the same scenes, degraded in the same way. If their fingerprints differ, their
+        pixels were made by different software.
+        """
+        if not self.recipe:
+            return ""
+        whole = hashlib.sha256(self.recipe.encode())
+        names = [name for name in KEYPOINT_DTYPE.names or () if name != "contrast"]
+        condition = "\n".join(self.condition.tolist()).encode("utf-8", "surrogatepass")
+        columns = (self.image_id, self.offsets, self.rung, self.scene_id, *(self.keypoints[name] for name in names))
+        for column in columns:
+            whole.update(np.ascontiguousarray(column).tobytes())
+        whole.update(condition)
+        return whole.hexdigest()
 
 
 class InvalidValue(PredictionsError):
@@ -188,6 +210,8 @@ class Predictions:
         Path or fingerprint of the dataset.
     fingerprint : str or None
         Fingerprint of the dataset. Scoring compares this fingerprint with the fingerprint of the truth.
+    truth_digest : str or None
+        :attr:`Truth.digest` of the dataset. If only the fingerprints differ, scoring warns of other pixels.
 
     Raises
     ------
@@ -213,6 +237,7 @@ class Predictions:
     detector: dict[str, Any] = field(default_factory=dict)
     dataset: str | None = None
     fingerprint: str | None = None
+    truth_digest: str | None = None
 
     def __post_init__(self) -> None:
         assign = object.__setattr__
@@ -235,6 +260,7 @@ class Predictions:
         detector: dict[str, Any] | None = None,
         dataset: str | None = None,
         fingerprint: str | None = None,
+        truth_digest: str | None = None,
     ) -> Predictions:
         """Make predictions from one :class:`Detections` per image.
 
@@ -244,7 +270,7 @@ class Predictions:
             One element per image. All or none of the elements with detections have identities.
         image_id : sequence of int, optional
             0, 1, 2, … if left out.
-        detector, dataset, fingerprint
+        detector, dataset, fingerprint, truth_digest
             See :class:`Predictions`.
 
         Raises
@@ -266,6 +292,7 @@ class Predictions:
             detector=detector or {},
             dataset=dataset,
             fingerprint=fingerprint,
+            truth_digest=truth_digest,
         )
 
     def detections(self) -> list[Detections]:

@@ -205,7 +205,13 @@ class Dataset:
         offsets, *columns = zip(*self._read_columns(("offsets", *names)), strict=True)
         counts = np.concatenate([np.diff(part) for part in offsets])
         whole = dict(zip(names, map(np.concatenate, columns), strict=True))
-        return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]), fingerprint=self.fingerprint)
+        recipe = canonical_json({key: value for key, value in self.config.items() if key != "pixels"})
+        return Truth(
+            **whole,
+            offsets=np.concatenate([[0], np.cumsum(counts)]),
+            fingerprint=self.fingerprint,
+            recipe=hashlib.sha256(encode_utf8(recipe)).hexdigest(),
+        )
 
     def verify(self) -> Iterator[ShardEntry]:
         """Check every field of the manifest and every byte of the shards. Yield each shard after its check.

@@ -38,9 +38,12 @@ from kpbench.dataset.shard import Sample, encode_shard
 from kpbench.errors import DataError
 from kpbench.files import folder_at, load_json, make_folder
 from kpbench.locks import lock_folder
-from kpbench.opencv import opencv_version, warn_of_opencv
+from kpbench.opencv import opencv_version, processor_features, warn_of_opencv
 from kpbench.workers import Progress, dask_executor, run_jobs
 from kpbench.writing import remove_leftovers, require_space, require_writable, write_file
+
+PIXELS = 2
+"""Version of the pixels. It is raised by hand whenever the same configuration gives other pixels than before."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ def generate(
     """
     refuse_resume_with_overwrite(resume, overwrite)
     with _open_executor(executor, scheduler) as executor:
-        folder, written = make_folder(folder_at(out)), config.to_dict()
+        folder, written = make_folder(folder_at(out)), _describe(config)
         # before a plan of a billion images is made and compared with the folder
         require_space(folder, config.n * config.image_bytes, f"{config.n} images", of_empty_disk=True)
         plan = plan_shards(config.n, config.shard_size)
@@ -185,7 +188,7 @@ def generate_part(
         raise DataError(f"`shards` is {asked}, expected {expected}, the number of shards")
     part = plan[shards.start : shards.stop]
     with _open_executor(executor, scheduler) as executor:
-        folder, written = make_folder(folder_at(out)), config.to_dict()
+        folder, written = make_folder(folder_at(out)), _describe(config)
         run = _Run(config, folder, written, part, workers, executor, progress)
         with lock_folder(folder, shared=True):
             kept = prepare_folder(folder, written, part, resume, overwrite)
@@ -211,7 +214,8 @@ def merge(out: str | Path, parts: Sequence[str | Path] = ()) -> Dataset:
     Raises
     ------
     DataError
-        If a shard is missing, is damaged, or belongs to another dataset than the first shard.
+        If a shard is missing, is damaged, or belongs to another dataset than the first shard. Shards whose pixels were
+        made with another OpenCV or on another kind of machine belong to another dataset.
 
     Examples
     --------
@@ -325,6 +329,19 @@ def _finish_dataset(
         write_card(Dataset(folder, manifest), folder)
         write_manifest(folder, manifest)
         return open_dataset(folder), broken_files
+
+
+def _describe(config: DatasetConfig) -> dict[str, Any]:
+    """Return the config that is written into every shard: what it says, and the software that its pixels depend on.
+
+    Shards with different configs are never mixed, in a resumed run or a merge. kpbench's own pixels do not depend on
+    the model of the processor. The pixels of a user's pipeline do.
+    """
+    content = config.to_dict()
+    pixels = {"version": PIXELS, "machine": platform.machine(), "opencv": opencv_version()}
+    if content.get("augmentation"):
+        pixels |= {"albumentations": metadata.version("albumentations"), "processor": processor_features()}
+    return {**content, "pixels": pixels}
 
 
 def _provenance(broken_files: tuple[str, ...]) -> dict[str, Any]:

@@ -182,9 +182,10 @@ def _collect(
             first = f"{source.path}, {labels[0]}: {found[0][1]}"
         raise DataError(f"detector {detector.name}: failed on all {len(found)} images, first {first}")
     about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
-    of_dataset = {}
+    of_dataset: dict[str, str] = {}
     if isinstance(source, Dataset):
         of_dataset = {"dataset": str(source.path), "fingerprint": source.fingerprint}
+        of_dataset["truth_digest"] = source.truth.digest
     predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
     return PredictionRun(predictions, failures)
 

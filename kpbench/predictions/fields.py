@@ -13,7 +13,7 @@ from kpbench.types import Predictions
 
 SCHEMA = "kpbench.predictions/1"
 """Name and version of the format of predictions files."""
-HEADER_KEYS = {"schema", "dataset", "fingerprint", "detector"}
+HEADER_KEYS = {"schema", "dataset", "fingerprint", "truth_digest", "detector"}
 TABLE_COLUMNS = ("image_id", "x", "y", "score", "id")
 """Columns of CSV and Parquet; score and id are optional."""
 H5_COLUMNS = {"image_id": "i", "offsets": "i", "xy": "f", "score": "f", "id": "i"}
@@ -43,7 +43,7 @@ EXPECTED_IN_RECORD = {
 
 
 def parse_header(content: Any) -> dict[str, Any]:
-    """Check a decoded header, and return its ``detector``, ``dataset`` and ``fingerprint``.
+    """Check a decoded header, and return its ``detector``, ``dataset``, ``fingerprint`` and ``truth_digest``.
 
     Raises
     ------
@@ -60,14 +60,15 @@ def parse_header(content: Any) -> dict[str, Any]:
         raise PredictionsError(f"detector is {json_type(detector)}, expected an object")
     if not isinstance(dataset, str | None):
         raise PredictionsError(f"dataset is {json_type(dataset)}, expected a path or a fingerprint")
-    fingerprint = content.get("fingerprint")
-    if not isinstance(fingerprint, str | None):
-        raise PredictionsError(f"fingerprint is {json_type(fingerprint)}, expected the fingerprint of a dataset")
-    return {"detector": detector, "dataset": dataset, "fingerprint": fingerprint}
+    digests = {name: content.get(name) for name in ("fingerprint", "truth_digest")}
+    for name, digest in digests.items():
+        if not isinstance(digest, str | None):
+            raise PredictionsError(f"{name} is {json_type(digest)}, expected the {name.replace('_', ' ')} of a dataset")
+    return {"detector": detector, "dataset": dataset, **digests}
 
 
 def make_header(predictions: Predictions) -> dict[str, Any]:
     """Return the header of predictions as a dict for JSON."""
-    named = {"dataset": predictions.dataset, "fingerprint": predictions.fingerprint}
+    named = {name: getattr(predictions, name) for name in ("dataset", "fingerprint", "truth_digest")}
     header = {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}
     return dict(escape_surrogates(header))

@@ -1,12 +1,13 @@
-"""Check that predictions belong to a dataset: first by fingerprint, then by image IDs."""
+"""Check that predictions belong to a dataset: first by fingerprint, then by the truth's digest, then by image IDs."""
 
 from __future__ import annotations
 
 import re
+import warnings
 
 import numpy as np
 
-from kpbench.errors import DataError, PredictionsError
+from kpbench.errors import DataError, KpbenchWarning, PredictionsError
 from kpbench.types import Int, Predictions, Truth
 
 
@@ -16,14 +17,22 @@ def find_images(truth: Truth, predictions: Predictions, allow_missing: bool) -> 
     Raises
     ------
     PredictionsError
-        If the fingerprints differ, an image is unknown, or an image is missing and ``allow_missing`` is False.
+        If the fingerprints and the digests of the truth differ, an image is unknown, or an image is missing and
+        ``allow_missing`` is False.
     DataError
         If two images of the dataset share an image_id.
     """
     named = predictions.fingerprint or predictions.dataset or ""
     if re.fullmatch("[0-9a-f]{64}", named) and truth.fingerprint and named != truth.fingerprint:
-        raise PredictionsError(
-            f"made for the dataset with fingerprint {named[:12]}…, but this dataset's is {truth.fingerprint[:12]}…"
+        if not truth.digest or predictions.truth_digest != truth.digest:
+            raise PredictionsError(
+                f"made for the dataset with fingerprint {named[:12]}…, but this dataset's is {truth.fingerprint[:12]}…"
+            )
+        warnings.warn(
+            "the predictions were made on the same scenes with other pixels, which other software made: "
+            f"the fingerprints are {named[:12]}… and {truth.fingerprint[:12]}…, the truth is the same",
+            KpbenchWarning,
+            stacklevel=4,
         )
     order = np.argsort(truth.image_id, kind="stable")
     ids = truth.image_id[order]
