@@ -197,12 +197,14 @@ def paint_patch(image: UInt8, mask: Mask, black: float, white: float) -> float:
     disc = mask.disc[in_box]
     if not disc.size:
         return 0.0
-    ink = white * disc - (white - black) * mask.black[in_box]
-    uncovered = 1.0 - disc
+    ink, part = (white - black) * mask.black[in_box], image[in_image]
     if image.ndim == 3:
-        ink, uncovered = ink[..., None], uncovered[..., None]
-    image[in_image] = np.rint(image[in_image] * uncovered + ink)
-    return float(disc.sum() / mask.disc.sum())
+        disc, ink = disc[..., None], ink[..., None]
+    change = (white - part.astype(np.float64)) * disc
+    change -= ink
+    change += part
+    image[in_image] = np.rint(change, out=change)
+    return 1.0 if disc.size == mask.disc.size else float(disc.sum() / mask.disc.sum())
 
 
 def fraction_inside(image: UInt8, mask: Mask) -> float:
