@@ -30,6 +30,7 @@ import numpy as np
 
 from kpbench.files import is_local, note_read, open_file
 from kpbench.hdf5_structure import Layout, StructureError, check_file
+from kpbench.memory import limit_process
 from kpbench.signals import block_end_signals
 
 CHECK_SECONDS, CHECK_BYTES_PER_SECOND = 1.0, 10e6
@@ -287,7 +288,7 @@ def _say(kind: str, content: Any) -> None:
 
 def check_files() -> None:
     """Check the files that the parent process names, until the parent process ends. This is the child process."""
-    _limit_memory()
+    limit_process(CHECK_MEMORY, 0)
     while True:
         try:
             questions, layout, is_remote = pickle.load(sys.stdin.buffer)
@@ -316,12 +317,3 @@ def _limit_time(seconds: float) -> None:
     """Let the system end this process after so much processor time; 0 lifts the limit."""
     if hasattr(signal, "setitimer"):  # not on Windows
         signal.setitimer(signal.ITIMER_PROF, seconds)
-
-
-def _limit_memory() -> None:
-    with suppress(ImportError, OSError, ValueError):  # not on every system
-        import resource
-
-        taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (taken + CHECK_MEMORY, resource.RLIM_INFINITY))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

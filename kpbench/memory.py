@@ -42,12 +42,17 @@ def require_memory(needed_bytes: int, what: str) -> None:
 
 
 def limit_process(more_bytes: int, seconds: float) -> None:
-    """Limit the memory that this process may take from now on, and its processor time. A child process calls this."""
+    """Limit the memory that this process may take from now on, and its processor time (0: no limit).
+
+    A child process calls this.
+    """
     with suppress(ImportError, OSError, ValueError):  # not on every system
         import resource
 
         taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (taken + more_bytes, resource.RLIM_INFINITY))
+        _, hard = resource.getrlimit(resource.RLIMIT_AS)  # a user's own limit stays
+        wanted = taken + more_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    if hasattr(signal, "setitimer"):  # not on Windows
+    if seconds and hasattr(signal, "setitimer"):  # not on Windows
         signal.setitimer(signal.ITIMER_PROF, seconds)

@@ -223,6 +223,11 @@ def require_removable(path: Path, kind: str) -> None:
         raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
 
 
+def is_leftover(path: Path) -> bool:
+    """Return whether a path has the name of an unfinished part of a file."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{8}\.part", path.name) is not None
+
+
 def remove_leftovers(paths: Iterable[Path]) -> None:
     """Remove the unfinished parts of files that a killed process left behind. Files at URLs have no such parts."""
     names: dict[Path, set[str]] = {}

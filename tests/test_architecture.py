@@ -38,7 +38,7 @@ GROUND = {
     "tiff": [],
     "decoding": ["errors", "memory", "tiff"],
     "hdf5_structure": [],
-    "hdf5": ["errors", "files", "signals", "hdf5_structure"],
+    "hdf5": ["errors", "files", "memory", "signals", "hdf5_structure"],
     "pixels": ["errors", "types", "files", "tiff", "decoding"],
     "containers": ["errors", "files"],
     "films": ["errors", "types", "decoding", "pixels", "containers"],

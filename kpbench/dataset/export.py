@@ -26,7 +26,7 @@ from kpbench.locks import LOCK_FILE, lock_folder
 from kpbench.text import escape_yaml
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
-from kpbench.writing import remove_file, require_space, write_file
+from kpbench.writing import is_leftover, remove_file, require_space, write_file
 
 EXPORT_MARK = "kpbench.export/1"
 """Mark in the main file of an export to COCO or YOLO."""
@@ -77,7 +77,7 @@ def export_dataset(
         if mark.read_bytes() != content:
             raise DataError(f"{folder}: holds another unfinished export; name a new folder as `out`")
     with lock_folder(make_folder(folder)):
-        for part in folder.rglob(".*.part"):  # of a killed run
+        for part in filter(is_leftover, folder.rglob(".*.part")):  # of a killed run
             part.unlink()
         require_space(folder, sum(shard.bytes for shard in dataset.shards), f"{len(dataset)} images")
         write_file(mark, content)

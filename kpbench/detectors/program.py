@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-import cv2
-
 from kpbench.errors import DataError, system_reason
+from kpbench.images import encode_png
 from kpbench.predictions.files import read_predictions
 from kpbench.types import Detections, UInt8
 
@@ -87,8 +86,10 @@ def run_program(command: str, images: Sequence[UInt8]) -> list[Detections]:
         folder, out = Path(scratch) / "images", Path(scratch) / "predictions.json"
         folder.mkdir()
         for n, image in enumerate(images):
-            if not cv2.imwrite(str(folder / f"{n:08d}.png"), image if image.ndim == 2 else image[..., ::-1]):
-                raise DataError(f"{folder}: cannot be written, is the disk full?")
+            try:
+                (folder / f"{n:08d}.png").write_bytes(encode_png(image, "program-input"))
+            except OSError as error:
+                raise DataError(f"{folder}: cannot be written, {system_reason(error) or error}") from None
         code, stderr = _run([*split_command(command), str(folder), str(out)], Path(scratch) / "stderr")
         if code:
             lines = stderr.strip().splitlines() or ["nothing on stderr"]

@@ -14,15 +14,19 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from kpbench.errors import DataError, system_reason
+from kpbench.files import read_bytes
 from kpbench.training.checkpoint import TrainingState
+from kpbench.writing import require_writable, write_file
 
+LOG = "log.jsonl"
 Record = Callable[[TrainingState, Mapping[str, Any]], None]
 """A function that logs figures at the current step."""
 
 
 @contextmanager
 def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
-    """Open the log ``log.jsonl``; yield a function that appends figures.
+    """Open the log ``log.jsonl``; yield a function that adds a line of figures, and writes the log anew.
 
     ``tensorboard`` : also write the figures to TensorBoard's files.
 
@@ -36,21 +40,24 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
         from torch.utils.tensorboard import SummaryWriter
 
         writer = SummaryWriter(folder)
-    with (folder / "log.jsonl").open("a", encoding="utf-8") as log:
+    path = folder / LOG
+    require_writable(path, "training-log")
+    try:
+        lines = read_bytes(path, is_noted=False).splitlines(keepends=True) if path.exists() else []
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
 
-        def record(state: TrainingState, figures: Mapping[str, Any]) -> None:
-            rounded = {k: float(f"{v:.5g}") for k, v in figures.items()}
-            at = {
-                "step": state.step,
-                "samples": state.step * state.recipe.batch,
-                "minutes": round(state.seconds / 60, 2),
-            }
-            log.write(json.dumps(at | rounded) + "\n")
-            log.flush()
-            for key, value in figures.items() if writer else ():
-                writer.add_scalar(key, value, at["samples"])
+    def record(state: TrainingState, figures: Mapping[str, Any]) -> None:
+        rounded = {k: float(f"{v:.5g}") for k, v in figures.items()}
+        samples = state.step * state.recipe.batch
+        at = {"step": state.step, "samples": samples, "minutes": round(state.seconds / 60, 2)}
+        mark = {} if lines else {"schema": "kpbench.training-log/1"}
+        lines.append(json.dumps(mark | at | rounded).encode() + b"\n")
+        write_file(path, b"".join(lines))
+        for key, value in figures.items() if writer else ():
+            writer.add_scalar(key, value, samples)
 
-        yield record
+    yield record
     if writer:
         writer.close()
 

@@ -72,7 +72,6 @@ WRITERS = {
     "dataset/export.py": "removes hidden parts of an export",
     "benchmark.py": "removes an empty folder",
     "detectors/program.py": "the temporary folder",
-    "training/run_log.py": "appends to log.jsonl",
 }
 """Modules that write or remove files by themselves, and what."""
 WRITING = {
@@ -310,3 +309,62 @@ def test_the_docs_warn_of_inverted_prints():
 def test_the_package_says_that_it_is_typed():
     assert (PACKAGE / "py.typed").is_file()
     assert not Path(PACKAGE / "py.typed").read_text().strip()
+
+
+@pytest.mark.parametrize("kind", ["text", "link", "pipe"])
+def test_the_log_of_a_training_is_no_file_of_the_users(tmp_path, kind):
+    from kpbench.errors import DataError
+    from kpbench.training.run_log import open_log
+
+    diary = tmp_path / "diary"
+    diary.write_text("dear diary\n")
+    log = tmp_path / "log.jsonl"
+    if kind == "text":
+        log.write_text("dear diary\n")
+    elif kind == "link":
+        log.symlink_to(diary)
+    else:
+        os.mkfifo(log)
+    with pytest.raises(DataError, match=r"log\.jsonl"), open_log(tmp_path, active=True, tensorboard=False):
+        pass
+    assert diary.read_text() == "dear diary\n"
+
+
+def test_an_export_keeps_hidden_files_of_the_users(here):
+    dataset = write_dataset(here / "set", IMAGES)
+    (here / "out").mkdir()
+    mark = f"kpbench.export/1 coco {dataset.fingerprint}\n"
+    (here / "out" / ".kpbench-unfinished").write_text(mark)
+    (here / "out" / ".notes.part").write_text("mine")
+    (here / "out" / ".annotations.json.0123abcd.part").write_text("half")
+    kpbench.export_dataset(dataset, "coco", here / "out")
+    assert (here / "out" / ".notes.part").read_text() == "mine"
+    assert not (here / "out" / ".annotations.json.0123abcd.part").exists()
+
+
+def test_a_limit_of_the_users_on_memory_stays_when_files_are_checked():
+    code = (
+        "import resource; from kpbench.memory import limit_process; limit_process(2**28, 0); "
+        "print(*resource.getrlimit(resource.RLIMIT_AS))"
+    )
+    done = subprocess.run(
+        ["bash", "-c", 'ulimit -v 8000000 && exec "$0" -c "$1"', sys.executable, code], capture_output=True, text=True
+    )
+    soft, hard = map(int, done.stdout.split())
+    assert hard == 8_000_000 * 1024
+    assert soft < 2**32
+
+
+def test_a_program_gets_its_images_in_a_folder_whose_name_is_no_text(here, monkeypatch):
+    folder = os.fsencode(here) + b"/t\xff"
+    os.mkdir(folder)
+    monkeypatch.setenv("TMPDIR", os.fsdecode(folder))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    (here / "finder.py").write_text(
+        "import json, os, sys\n"
+        "names = sorted(os.listdir(sys.argv[1]))\n"
+        "found = [{'image_id': n, 'keypoints': []} for n, _ in enumerate(names)]\n"
+        "json.dump({'schema': 'kpbench.predictions/1', 'predictions': found}, open(sys.argv[2], 'w'))\n"
+    )
+    command = f"program:{sys.executable} {here / 'finder.py'}"
+    assert len(kpbench.load_detector(command)(np.zeros((40, 50), np.uint8))) == 0
