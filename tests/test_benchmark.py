@@ -4,7 +4,6 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import pytest
 from helpers import kpbench
 
@@ -12,6 +11,7 @@ from kpbench.benchmark import bench, count_bench_images
 from kpbench.detectors import interface as detect
 from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
+from kpbench.images import encode_png
 from kpbench.predictions.files import read_predictions
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
@@ -180,7 +180,7 @@ def test_a_program_is_run_on_many_images_at_once_and_on_one_by_one_if_it_fails(h
     assert (here / "calls.txt").read_text() == "16 "
     found = read_predictions(run.predictions)
     assert found.patch_id.tolist() == [2] * 16
-    size = [len(cv2.imencode(".png", run.dataset.image(n))[1]) for n in range(16)]
+    size = [len(encode_png(run.dataset.image(n), "program-input")) for n in range(16)]
     assert found.xy[:, 0].tolist() == size
     (frail,) = bench([FEW], [f"{command} --frail"], "out", workers=1)
     assert [image_id for image_id, _ in frail.failures] == [n for n in range(16) if size[n] % 3 == 0]

@@ -18,7 +18,15 @@ import numpy as np
 import pytest
 from helpers import kpbench, perfect_predictions, write_dataset
 
-from kpbench import generate, hdf5, merge, read_predictions, write_predictions
+from kpbench import (
+    export_dataset,
+    generate,
+    hdf5,
+    load_detector,
+    merge,
+    read_predictions,
+    write_predictions,
+)
 from kpbench.dataset import generate_part
 from kpbench.decoding import MOST_PIXELS, MOST_PIXELS_PER_BYTE
 from kpbench.detectors.inference import TRIAL_BYTES, TRIAL_PX, TRIAL_SECONDS
@@ -337,7 +345,7 @@ def test_an_export_keeps_hidden_files_of_the_users(here):
     (here / "out" / ".kpbench-unfinished").write_text(mark)
     (here / "out" / ".notes.part").write_text("mine")
     (here / "out" / ".annotations.json.0123abcd.part").write_text("half")
-    kpbench.export_dataset(dataset, "coco", here / "out")
+    export_dataset(dataset, "coco", here / "out")
     assert (here / "out" / ".notes.part").read_text() == "mine"
     assert not (here / "out" / ".annotations.json.0123abcd.part").exists()
 
@@ -367,4 +375,4 @@ def test_a_program_gets_its_images_in_a_folder_whose_name_is_no_text(here, monke
         "json.dump({'schema': 'kpbench.predictions/1', 'predictions': found}, open(sys.argv[2], 'w'))\n"
     )
     command = f"program:{sys.executable} {here / 'finder.py'}"
-    assert len(kpbench.load_detector(command)(np.zeros((40, 50), np.uint8))) == 0
+    assert len(load_detector(command)(np.zeros((40, 50), np.uint8))) == 0
