@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError, KpbenchWarning, PredictionsError, system_reason
-from kpbench.files import load_json, path_below, read_bytes
+from kpbench.files import path_below, read_bytes
 from kpbench.predictions.coco_fields import (
+    ANNOTATION_COLUMNS,
     EXPECTED_IN_COCO,
+    IMAGE_COLUMNS,
+    RESULT_COLUMNS,
     CocoAnnotation,
-    CocoAnnotations,
-    CocoFile,
     CocoImage,
-    CocoInfo,
     CocoResult,
-    column,
+    Columns,
     find_outside,
-    points_of,
+    make_columns,
     require_possible_images,
     require_possible_keypoints,
 )
@@ -36,9 +33,8 @@ from kpbench.predictions.decode import (
     json_type,
     parse_json,
     pause_gc,
-    require_single_keys,
     require_utf8,
-    split_list,
+    split_lists,
 )
 from kpbench.predictions.table_files import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
@@ -135,12 +131,14 @@ def open_coco(path: str | Path) -> CocoDataset:
         data = read_bytes(path)
         require_utf8(data)
         with pause_gc():
-            content = _decode_annotations(data)
-            truth = _make_truth(content, content.info.fingerprint or hashlib.sha256(data).hexdigest())
-            files = tuple(image.file_name for image in content.images)
-            _warn_of_orientation(path, content.images[:IMAGES_LOOKED_AT])
-            _warn_of_keypoints_outside(path, content.images, truth)
-            del content  # freed before the garbage collector resumes and scans it
+            info, images, annotations = _decode_annotations(data)
+        fingerprint = info.get("fingerprint") if isinstance(info, dict) else None
+        if not isinstance(fingerprint, str) or not fingerprint:
+            fingerprint = hashlib.sha256(data).hexdigest()
+        truth = _make_truth(images, annotations, fingerprint)
+        files = tuple(images["file_name"].tolist())
+        _warn_of_orientation(path, images)
+        _warn_of_keypoints_outside(path, images, truth)
         return CocoDataset(path, truth, files)
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
@@ -148,13 +146,14 @@ def open_coco(path: str | Path) -> CocoDataset:
         raise DataError(f"{path}: {error}") from None
 
 
-def _warn_of_orientation(path: Path, images: Sequence[CocoImage]) -> None:
+def _warn_of_orientation(path: Path, images: Columns) -> None:
     """Warn if an image stands upright in the annotations and lies on its side when it is read, or the reverse."""
-    for image in images:
-        if not image.file_name or not image.width or image.width == image.height:
+    first = (images[name][:IMAGES_LOOKED_AT].tolist() for name in ("file_name", "width", "height"))
+    for name, width, height in zip(*first, strict=True):
+        if not name or not width or width == height:
             continue
         try:
-            files = [path_below(path.parent, prefix + image.file_name) for prefix in ("", "images/")]
+            files = [path_below(path.parent, prefix + name) for prefix in ("", "images/")]
         except DataError:  # told when the image is read
             continue
         file = next((file for file in files if file.is_file()), None)
@@ -163,9 +162,9 @@ def _warn_of_orientation(path: Path, images: Sequence[CocoImage]) -> None:
         from kpbench.pixels import read_size  # here, as scores need no OpenCV
 
         size = read_size(file)
-        if size is not None and size == (image.height, image.width):
+        if size is not None and size == (height, width):
             warnings.warn(
-                f"{path}: {image.file_name} is {image.width:g} x {image.height:g} there, but {size[0]} x {size[1]} "
+                f"{path}: {name} is {width:g} x {height:g} there, but {size[0]} x {size[1]} "
                 "when it is read, as its EXIF data rotates it; the truth must be in that orientation",
                 KpbenchWarning,
                 stacklevel=3,
@@ -173,10 +172,10 @@ def _warn_of_orientation(path: Path, images: Sequence[CocoImage]) -> None:
             return
 
 
-def _warn_of_keypoints_outside(path: Path, images: Sequence[CocoImage], truth: Truth) -> None:
+def _warn_of_keypoints_outside(path: Path, images: Columns, truth: Truth) -> None:
     """Warn if keypoints lie outside of the width and height that the annotations state."""
     counts = np.diff(truth.offsets)
-    width, height = (np.array([getattr(i, name) or 0.0 for i in images], float) for name in ("width", "height"))
+    width, height = images["width"], images["height"]
     outside = find_outside(np.repeat(width, counts), np.repeat(height, counts), truth.keypoints)
     if len(outside):
         k = truth.keypoints[outside[0]]
@@ -190,53 +189,48 @@ def _warn_of_keypoints_outside(path: Path, images: Sequence[CocoImage], truth: T
         )
 
 
-def _decode_annotations(data: bytes) -> CocoAnnotations:
+def _decode_annotations(data: bytes) -> tuple[Any, Columns, Columns]:
+    """Return ``info``, the images and the annotations."""
+
+    def place_image(n: int) -> str:
+        return f"images[{n}]"
+
+    def place_annotation(n: int) -> str:
+        return f"annotations[{n}]"
+
     try:
-        file = msgspec.json.decode(data, type=CocoFile)
-        images = msgspec.json.decode(file.images, type=list[CocoImage])
-        annotations = msgspec.json.decode(file.annotations, type=list[CocoAnnotation])
-        parts = {b"images": bytes(file.images), b"annotations": bytes(file.annotations)}
-        load_json(_cut_lists(data, parts))  # finds a key that is there twice
-        require_single_keys(parts[b"images"], images, CocoImage)
-        require_single_keys(parts[b"annotations"], annotations, CocoAnnotation)
-        return CocoAnnotations(images, annotations, file.info)
+        frame, (images, annotations) = split_lists(data, "images", "annotations")
+        return (
+            frame.get("info"),
+            make_columns(decode_records(images, CocoImage, EXPECTED_IN_COCO, place_image), IMAGE_COLUMNS),
+            make_columns(
+                decode_records(annotations, CocoAnnotation, EXPECTED_IN_COCO, place_annotation), ANNOTATION_COLUMNS
+            ),
+        )
     except (ValueError, RecursionError):
-        content = parse_json(data, "the file")  # decoded again, to find the place of the fault
+        content = parse_json(data, "the file")  # decoded at once, to find any fault
     if not isinstance(content, dict):
         raise DataError(f"holds {json_type(content)}, expected COCO annotations") from None
     for name in ("images", "annotations"):
         if not isinstance(content.get(name), list):
             raise DataError(f"has no list {name!r}, expected COCO annotations") from None
-    info = content.get("info")
-    fingerprint = info.get("fingerprint") if isinstance(info, dict) else None
-    return CocoAnnotations(
-        convert_records(content["images"], CocoImage, EXPECTED_IN_COCO, lambda n: f"images[{n}]"),
-        convert_records(content["annotations"], CocoAnnotation, EXPECTED_IN_COCO, lambda n: f"annotations[{n}]"),
-        CocoInfo(fingerprint if isinstance(fingerprint, str) else ""),
+    return (
+        content.get("info"),
+        make_columns([convert_records(content["images"], CocoImage, EXPECTED_IN_COCO, place_image)], IMAGE_COLUMNS),
+        make_columns(
+            [convert_records(content["annotations"], CocoAnnotation, EXPECTED_IN_COCO, place_annotation)],
+            ANNOTATION_COLUMNS,
+        ),
     )
 
 
-def _cut_lists(data: bytes, lists: dict[bytes, bytes]) -> bytes:
-    """Return a JSON object with 0 in place of the lists, or the whole object if a list is not where its name is."""
-    spans = list[tuple[int, int]]()
-    for name, content in lists.items():
-        start = data.find(b'"%s"' % name) + len(name) + 2
-        start += len(data[start : start + 100]) - len(data[start : start + 100].lstrip(b" \t\r\n:"))
-        if not data.startswith(content, start):
-            return data
-        spans.append((start, start + len(content)))
-    ends = [0, *chain.from_iterable(sorted(spans)), len(data)]
-    return b"0".join(data[a:b] for a, b in zip(ends[::2], ends[1::2], strict=True))
-
-
-def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
-    images, annotations = content.images, content.annotations
-    ids = np.array([image.id for image in images], np.int64)
+def _make_truth(images: Columns, annotations: Columns, fingerprint: str) -> Truth:
+    ids = images["id"]
     sorter = np.argsort(ids, kind="stable")
     if np.any(np.diff(ids[sorter]) == 0):
         raise DataError("two images share an id")
     require_possible_images(images)
-    image_id = column(annotations, "image_id", np.int64)
+    image_id = annotations["image_id"]
     keypoints, labelled = _make_keypoints(annotations)
     place = np.searchsorted(ids, image_id, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != image_id
@@ -250,26 +244,26 @@ def _make_truth(content: CocoAnnotations, fingerprint: str) -> Truth:
         image_id=ids,
         offsets=offsets_of(np.bincount(image, minlength=len(ids))),
         keypoints=keypoints if is_in_order else keypoints[rows],
-        condition=np.array([image.condition for image in images], np.str_),
-        rung=np.array([np.nan if image.rung is None else image.rung for image in images]),
-        scene_id=np.array([image.id if image.scene_id is None else image.scene_id for image in images], np.int64),
+        condition=images["condition"].astype(np.str_),
+        rung=images["rung"],
+        scene_id=np.where(images["scene_id"] < 0, ids, images["scene_id"]),
         fingerprint=fingerprint,
     )
 
 
-def _make_keypoints(annotations: list[CocoAnnotation]) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+def _make_keypoints(annotations: Columns) -> tuple[NDArray[Any], NDArray[np.bool_]]:
     """Return the keypoints of all annotations, of type KEYPOINT_DTYPE, and whether each is labelled (v over 0)."""
-    table = np.zeros(len(annotations), KEYPOINT_DTYPE)
-    points = points_of(annotations)
+    points = annotations["keypoints"]
+    table = np.zeros(len(points), KEYPOINT_DTYPE)
     table["x"], table["y"] = points[:, 0], points[:, 1]
-    table["patch_id"] = column(annotations, "category_id", np.int64) - 1
-    radius, major, minor = (column(annotations, name) for name in ("radius", "radius_major", "radius_minor"))
+    table["patch_id"] = annotations["category_id"] - 1
+    radius, major, minor = (annotations[name] for name in ("radius", "radius_major", "radius_minor"))
     with np.errstate(over="ignore"):  # some columns have 32 bits; a number that they cannot hold is refused as inf
-        for name, missing in (("axis_angle", 0.0), ("visible", 1.0)):
-            table[name] = column(annotations, name, missing=missing)
+        for name in ("axis_angle", "visible"):
+            table[name] = annotations[name]
         table["radius_major"] = np.where(np.isnan(major), radius, major)
         table["radius_minor"] = np.where(np.isnan(minor), table["radius_major"], minor)
-    require_possible_keypoints(annotations, points, table)
+    require_possible_keypoints(annotations, table)
     return table, points[:, 2] > 0
 
 
@@ -290,26 +284,13 @@ def decode_coco_results(data: bytes) -> Predictions:
         return f"results[{n}]"
 
     try:
-        frame, pieces = split_list(data, r"^\s*\[")
-        if frame != []:
-            raise ValueError
-        parts = [_to_columns(batch) for batch in decode_records(pieces, CocoResult, EXPECTED_IN_COCO, place)]
+        _, [pieces] = split_lists(data)
+        table = make_columns(decode_records(pieces, CocoResult, EXPECTED_IN_COCO, place), RESULT_COLUMNS)
     except (ValueError, RecursionError):  # the list cannot be split: decode the file at once, and find any fault
         entries = parse_json(data, "the file")
         if not isinstance(entries, list):
             raise PredictionsError(f"holds {json_type(entries)}, expected a list of COCO keypoint results") from None
-        parts = [_to_columns(convert_records(entries, CocoResult, EXPECTED_IN_COCO, place))]
-    columns = map(np.concatenate, zip(_to_columns([]), *parts, strict=True))
-    return build_predictions(dict(zip(("image_id", "id", "score", "x", "y"), columns, strict=True)), {}, place)
-
-
-def _to_columns(batch: list[CocoResult]) -> tuple[NDArray[Any], ...]:
-    """Return the columns ``image_id, id, score, x, y`` of some results."""
-    points = points_of(batch)
-    return (
-        column(batch, "image_id", np.int64),
-        column(batch, "category_id") - 1,
-        column(batch, "score"),
-        points[:, 0],
-        points[:, 1],
-    )
+        table = make_columns([convert_records(entries, CocoResult, EXPECTED_IN_COCO, place)], RESULT_COLUMNS)
+    x, y, _ = table["keypoints"].T
+    rows = {"image_id": table["image_id"], "id": table["category_id"] - 1.0, "score": table["score"], "x": x, "y": y}
+    return build_predictions(rows, {}, place)

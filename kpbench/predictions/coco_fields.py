@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from operator import attrgetter
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
+from kpbench.predictions.decode import Batch
 from kpbench.types import Float
 
 LARGEST_PX = 10**6
@@ -54,28 +55,6 @@ class CocoAnnotation(msgspec.Struct, gc=False):
     visible: float | msgspec.UnsetType = msgspec.UNSET
 
 
-class CocoInfo(msgspec.Struct):
-    """The ``info`` object. The fingerprint is kpbench's addition."""
-
-    fingerprint: str = ""
-
-
-class CocoFile(msgspec.Struct):
-    """A COCO annotations file whose long lists are not yet decoded."""
-
-    images: msgspec.Raw
-    annotations: msgspec.Raw
-    info: CocoInfo = msgspec.field(default_factory=CocoInfo)
-
-
-class CocoAnnotations(msgspec.Struct):
-    """A COCO annotations file."""
-
-    images: list[CocoImage]
-    annotations: list[CocoAnnotation]
-    info: CocoInfo = msgspec.field(default_factory=CocoInfo)
-
-
 class CocoResult(msgspec.Struct, gc=False):
     """An entry of a results file: a detection."""
 
@@ -106,55 +85,102 @@ EXPECTED_IN_COCO = {
 """The expected value of each field of the records above, in words."""
 
 
-def column(
-    entries: Sequence[CocoAnnotation | CocoResult], name: str, kind: type = np.float64, missing: float = np.nan
-) -> NDArray[Any]:
-    """Return a field of all entries. ``missing`` stands for UNSET, and nan for None."""
-    values = map(attrgetter(name), entries)
-    try:
-        return np.fromiter(values, kind, len(entries))
-    except TypeError:  # some value is UNSET
-        return np.array([missing if v is msgspec.UNSET else v for v in map(attrgetter(name), entries)], kind)
+Columns = dict[str, NDArray[Any]]
+"""For each field, the values of all records."""
+IMAGE_COLUMNS: dict[str, tuple[type, Any]] = {
+    "id": (int, None),
+    "file_name": (object, ""),
+    "width": (float, 0.0),
+    "height": (float, 0.0),
+    "condition": (object, ""),
+    "rung": (float, np.nan),
+    "scene_id": (int, -1),
+}
+ANNOTATION_COLUMNS: dict[str, tuple[type, Any]] = {
+    "image_id": (int, None),
+    "category_id": (int, None),
+    "id": (object, None),
+    "radius": (float, np.nan),
+    "radius_major": (float, np.nan),
+    "radius_minor": (float, np.nan),
+    "axis_angle": (float, 0.0),
+    "visible": (float, 1.0),
+}
+RESULT_COLUMNS: dict[str, tuple[type, Any]] = {
+    "image_id": (int, None),
+    "category_id": (int, None),
+    "score": (float, 0.0),
+}
+"""For each field but ``keypoints``, the type of its column, and the value that stands for null and for no value."""
 
 
-def points_of(entries: Sequence[CocoAnnotation | CocoResult]) -> Float:
-    """Return an array with a row (x, y, v) per entry."""
-    points = chain.from_iterable(map(attrgetter("keypoints"), entries))
-    return np.fromiter(points, np.float64, 3 * len(entries)).reshape(-1, 3)
+def make_columns(batches: Iterable[Batch[Any]], kinds: Mapping[str, tuple[type, Any]]) -> Columns:
+    """Make a column of each field of ``kinds``. The column ``keypoints`` has a row (x, y, v) per record.
+
+    Columns of numbers hold inf in place of a given NaN.
+    """
+
+    def column(batch: Batch[Any], name: str) -> NDArray[Any]:
+        records, (kind, missing) = batch.records, kinds[name]
+        if name not in batch.keys:
+            return np.full(len(records), missing, kind)
+        try:
+            values: NDArray[Any] = np.fromiter(map(attrgetter(name), records), kind, len(records))
+            if kind is not float or not np.isnan(values).any():
+                return values
+        except TypeError:  # some value is UNSET, or is null in place of a whole number
+            pass
+        given = [getattr(record, name) for record in records]
+        return np.array([missing if v in (None, msgspec.UNSET) else v if v == v else np.inf for v in given], kind)
+
+    def points(batch: Batch[Any]) -> Float:
+        values = chain.from_iterable(map(attrgetter("keypoints"), batch.records))
+        return np.fromiter(values, float, 3 * len(batch.records)).reshape(-1, 3)
+
+    parts: dict[str, list[NDArray[Any]]] = {name: [np.zeros(0, kind)] for name, (kind, _) in kinds.items()}
+    if kinds is not IMAGE_COLUMNS:
+        parts["keypoints"] = [np.zeros((0, 3))]
+    for batch in batches:  # the records of a batch are freed before the next one is decoded
+        for name, arrays in parts.items():
+            arrays.append(points(batch) if name == "keypoints" else column(batch, name))
+    return {name: np.concatenate(arrays) for name, arrays in parts.items()}
 
 
 # --- Values --------------------------------------------------------------------------------------------------------
 
 
-def require_possible_images(images: Sequence[CocoImage]) -> None:
+def require_possible_images(images: Columns) -> None:
     """Refuse images with a value that no image has.
 
     Raises
     ------
     DataError
-        At the first such value.
+        At the first such value of a field.
     """
-    for n, image in enumerate(images):
-        for name, value in (("width", image.width), ("height", image.height)):
-            if value is not None and not (0 <= value <= LARGEST_PX and value == int(value)):
-                expected = f"a whole number of px up to {LARGEST_PX}, or 0 or null if unknown"
-                raise DataError(f"images[{n}] (id {image.id}): {name} is {value}, expected {expected}")
-        if image.rung is not None and not abs(image.rung) <= LARGEST_RUNG:
-            expected = f"a finite number up to {LARGEST_RUNG:g}"
-            raise DataError(f"images[{n}] (id {image.id}): rung is {image.rung}, expected {expected}")
-        if not image.condition.isprintable():
-            raise DataError(f"images[{n}] (id {image.id}): condition is {image.condition!r}, expected a text")
+
+    def refuse(name: str, valid: NDArray[np.bool_], expected: str) -> None:
+        if not valid.all():
+            n = int(np.argmin(valid))
+            value = images[name].tolist()[n]
+            raise DataError(f"images[{n}] (id {images['id'][n]}): {name} is {value!r}, expected {expected}")
+
+    for name in ("width", "height"):
+        size = images[name]
+        possible = (size >= 0) & (size <= LARGEST_PX) & (size == np.floor(size))
+        refuse(name, possible, f"a whole number of px up to {LARGEST_PX}, or 0 or null if unknown")
+    rung, condition = images["rung"], images["condition"]
+    refuse("rung", np.isnan(rung) | (np.abs(rung) <= LARGEST_RUNG), f"a finite number up to {LARGEST_RUNG:g}")
+    refuse("condition", np.fromiter(map(str.isprintable, condition), bool, len(condition)), "a text")
 
 
-def require_possible_keypoints(annotations: Sequence[CocoAnnotation], points: Float, table: NDArray[Any]) -> None:
+def require_possible_keypoints(annotations: Columns, table: NDArray[Any]) -> None:
     """Refuse annotations with a value that no keypoint has, and two annotations of one keypoint.
 
     The coordinates and the radius of a keypoint that is not labelled (v = 0) may be anything.
 
     Parameters
     ----------
-    annotations : sequence of CocoAnnotation
-    points : ndarray of shape (n, 3)
+    annotations : dict of str to ndarray of shape (n, ...)
     table : ndarray of shape (n,), KEYPOINT_DTYPE
 
     Raises
@@ -168,13 +194,12 @@ def require_possible_keypoints(annotations: Sequence[CocoAnnotation], points: Fl
             n = int(np.argmax(wrong))
             values = {name: table[name][n].item() for name in ("radius_major", "axis_angle", "visible")}
             text = problem.format(x=points[n, 0], y=points[n, 1], v=points[n, 2], **values)
-            raise DataError(f"annotations[{n}] (image_id {annotations[n].image_id}): {text}")
+            raise DataError(f"annotations[{n}] (image_id {annotations['image_id'][n]}): {text}")
 
+    points = annotations["keypoints"]
     labelled = points[:, 2] != 0
-    lacks_radius = labelled & np.isnan(table["radius_major"])
-    for n in np.flatnonzero(lacks_radius).tolist():  # the file may hold NaN
-        lacks_radius[n] = annotations[n].radius is None and annotations[n].radius_major is None
     refuse(~np.isin(points[:, 2], (0, 1, 2)), "the visibility v of keypoints is {v:g}, expected 0, 1 or 2")
+    lacks_radius = labelled & np.isnan(table["radius_major"])
     refuse(lacks_radius, "has no radius, expected radius, or radius_major and radius_minor, in px")
     refuse(~(np.abs(table["axis_angle"]) <= LARGEST_PX), "axis_angle is {axis_angle}, expected degrees")
     refuse(~(np.abs(table["visible"]) <= LARGEST_PX), "visible is {visible}, expected a fraction")
@@ -186,19 +211,19 @@ def require_possible_keypoints(annotations: Sequence[CocoAnnotation], points: Fl
         labelled & ~possible,
         "keypoints are [{x}, {y}, {v}] and the radius is {radius_major}, expected " + expected,
     )
-    _require_different(annotations, points, labelled)
+    _require_different(annotations, labelled)
 
 
-def _require_different(annotations: Sequence[CocoAnnotation], points: Float, labelled: NDArray[np.bool_]) -> None:
+def _require_different(annotations: Columns, labelled: NDArray[np.bool_]) -> None:
     """Refuse two annotations with one id, and two keypoints at one place of an image."""
-    found = [annotation.id for annotation in annotations]
-    if len(set(found)) - (None in set(found)) < len(found) - found.count(None):
+    found = annotations["id"].tolist()
+    if len(set(found)) < len(found):
         first = dict[Any, int]()
         for n, value in enumerate(found):
             if value is not None and first.setdefault(value, n) != n:
                 raise DataError(f"annotations[{n}] has the id {value!r} of annotations[{first[value]}]")
     rows = np.flatnonzero(labelled)
-    image_id, x, y = column(annotations, "image_id", np.int64)[rows], points[rows, 0], points[rows, 1]
+    image_id, (x, y, _) = annotations["image_id"][rows], annotations["keypoints"][rows].T
     order = np.argsort(x)  # few keypoints share their x, so that little is left to sort
     shared = np.append(np.diff(x[order]) == 0, False)[: len(order)]
     order = order[shared | np.roll(shared, 1)]
@@ -210,7 +235,7 @@ def _require_different(annotations: Sequence[CocoAnnotation], points: Float, lab
         k = int(np.argmax(same))
         a, b = sorted((int(rows[order[k]]), int(rows[order[k + 1]])))
         raise DataError(
-            f"annotations[{b}] (image_id {annotations[b].image_id}): is at the place of annotations[{a}], "
+            f"annotations[{b}] (image_id {annotations['image_id'][b]}): is at the place of annotations[{a}], "
             "expected one annotation per keypoint"
         )
 

@@ -7,19 +7,20 @@ piece is decoded again into plain objects. The second decoding finds the place o
 from __future__ import annotations
 
 import gc
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import msgspec
 
 from kpbench.errors import PredictionsError
 from kpbench.files import DoubleKeyError, escape_surrogates, load_json
 
-PIECE_BYTES = 4 * 2**20
-"""Bytes of JSON that are decoded at a time."""
+PIECE_BYTES = 2**18
+"""Bytes of JSON that are decoded at a time. The records of a piece then fit into the cache of a processor."""
 
 Record = TypeVar("Record", bound=msgspec.Struct)
 Expected = Mapping[str, str]
@@ -28,54 +29,76 @@ Place = Callable[[int], str]
 """A function that names the n-th record of a file, such as ``predictions[12]``."""
 
 
-def split_list(data: bytes, opening: str) -> tuple[Any, Iterator[bytes]]:
-    """Split the long list of a JSON text into shorter lists.
+def split_lists(data: bytes, *names: str) -> tuple[Any, list[Iterator[bytes]]]:
+    """Split the long lists of a JSON text into shorter lists.
 
-    A list that is decoded at once takes several times the memory of its text. The list is split at closing braces, so
-    its records must not contain objects. No other list may follow in the text.
+    A list that is decoded at once takes several times the memory of its text, and more time than pieces that fit into
+    the cache of a processor. Records may contain objects, but no lists of objects.
 
     Parameters
     ----------
     data : bytes
-    opening : str
-        Regular expression for the text that ends with the opening bracket of the list.
+        An object whose values include the lists, or a list.
+    names : str
+        Key of each list in the object. Without names, the text is the list.
 
     Returns
     -------
     frame : decoded JSON
-        The text with an empty list in place of the long list; the whole text if ``opening`` is not found.
-    pieces : iterator of bytes
-        The shorter lists, as JSON; none if ``opening`` is not found. Iteration raises ValueError where the list cannot
-        be split.
+        The text without the lists.
+    lists : list of iterators of bytes
+        For each name, the shorter lists, as JSON.
 
     Raises
     ------
     ValueError
-        If the frame is not JSON.
+        If the rest of the text is not JSON, or the lists are not found. A list without objects is never found. If the
+        lists are split at wrong places, some shorter list is not JSON.
     """
-    found = re.search(opening.encode(), data)
-    start, stop = (found.end(), data.rfind(b"]")) if found else (0, 0)
-    frame = load_json(data[:start] + data[stop:])
+    key = rb'"(%s)"%s:' % ("|".join(names).encode(), _BLANK) if names else rb"^()"
+    opening = re.compile(rb"%s%s(?=\[%s\{)" % (key, _BLANK, _BLANK))
+    rest, spans, end = list[bytes](), dict[str, tuple[int, int]](), 0
+    while found := opening.search(data, end):
+        last = _LAST.search(data, found.end())
+        if last is None or found[1].decode() in spans:
+            raise ValueError("a list has no end, or is there twice")
+        rest.append(data[end : found.end()])
+        spans[found[1].decode()], end = (found.end() + 1, last.start() + 1), last.end()
+    frame = load_json((b'"%s"' % _MARK.encode()).join([*rest, data[end:]]))
+    content = frame if names and isinstance(frame, dict) else {"": frame}
+    if any(content.pop(name, None) != _MARK for name in names or ("",)):
+        raise ValueError("a list is not found")
+    return frame, [_split_span(data, *spans[name]) for name in names or ("",)]
 
-    def pieces() -> Iterator[bytes]:
-        low, more = start, False
-        while low < stop or more:
-            high = data.find(b"}", low + PIECE_BYTES, stop) + 1 or stop
-            piece = data[low:high]
-            if more and not piece.strip():
-                raise ValueError("nothing after a comma")
-            yield b"[%s]" % piece
-            comma = data.find(b",", high, stop)
-            more, low = comma >= 0, comma + 1 if comma >= 0 else stop
-            if data[high : comma if more else stop].strip():
-                raise ValueError("no comma after a record")
 
-    return frame, pieces()
+_BLANK = rb"[ \t\r\n]*"
+_LAST = re.compile(rb"\}%s\]" % _BLANK)
+"""The end of a list of objects."""
+_NEXT = re.compile(rb"\}%s,%s(?=\{)" % (_BLANK, _BLANK))
+"""The end of an object in a list, if another object follows."""
+_MARK = f"a list {os.urandom(16).hex()}"
+"""The text that stands for a list that is cut out. It is random, so that no file can hold it."""
+
+
+def _split_span(data: bytes, low: int, stop: int) -> Iterator[bytes]:
+    view = memoryview(data)
+    while cut := _NEXT.search(data, low + PIECE_BYTES, stop):
+        yield b"[%b]" % view[low : cut.start() + 1]
+        low = cut.end()
+    yield b"[%b]" % view[low:stop]
+
+
+class Batch(NamedTuple, Generic[Record]):
+    """Some typed records of a list."""
+
+    records: list[Record]
+    keys: Collection[str]
+    """Names of all fields that the records have in the file. Fields that no record has may be included."""
 
 
 def decode_records(
     pieces: Iterable[bytes], record: type[Record], expected: Expected, place: Place
-) -> Iterator[list[Record]]:
+) -> Iterator[Batch[Record]]:
     """Decode the typed records of each piece of a list.
 
     Parameters
@@ -98,60 +121,68 @@ def decode_records(
     start = 0
     for piece in pieces:
         try:
-            batch: list[Record] = decoder.decode(piece)
-            require_single_keys(piece, batch, record)
+            records: list[Record] = decoder.decode(piece)
+            batch = Batch(records, require_single_keys(piece, records, record))
         except DoubleKeyError as error:
             raise PredictionsError(str(error)) from None
         except (ValueError, RecursionError):
             first = start
             batch = convert_records(load_json(piece), record, expected, lambda n: place(first + n))  # noqa: B023
         yield batch
-        start += len(batch)
+        start += len(batch.records)
 
 
-def require_single_keys(data: bytes, records: Sequence[Record], record: type[Record]) -> None:
+def require_single_keys(data: bytes, records: Sequence[Record], record: type[Record]) -> Collection[str]:
     """Refuse a JSON list of records in which an object has a key twice. msgspec takes the last one in silence.
 
     Records with keys that are not fields are compared with the first one. Otherwise, and if they have other keys than
     the first one, keys are counted in the text and in the records. Only if the counts differ, the text is decoded again
     into plain objects. Objects within the records may not be looked at.
 
+    Returns
+    -------
+    collection of str
+        :attr:`Batch.keys`.
+
     Raises
     ------
     DoubleKeyError
     """
     names, defaults = record.__struct_fields__, record.__struct_defaults__
-    if not record.__struct_config__.forbid_unknown_fields and _has_keys_of_first(data, len(records)):
-        return
+    if not record.__struct_config__.forbid_unknown_fields:
+        keys = _keys_of_all(data, len(records))
+        if keys:
+            return keys
     counts = dict.fromkeys(names, len(records))
     for name, default in zip(names[len(names) - len(defaults) :], defaults, strict=True):
         counts[name] -= list(map(attrgetter(name), records)).count(default)
-    if data.count(b":") == sum(counts.values()):
-        return
-    if b"\\" in data or any(data.count(b'"%s"' % name.encode()) != count for name, count in counts.items()):
+    if data.count(b":") != sum(counts.values()) and (
+        b"\\" in data or any(data.count(b'"%s"' % name.encode()) != count for name, count in counts.items())
+    ):
         load_json(data)
+    return names
 
 
 NUMBER_BYTES = b"0123456789+-.eE[], \t\r\n"
 """What numbers and lists of numbers are written with."""
 
 
-def _has_keys_of_first(data: bytes, count: int) -> bool:
-    """Return whether the objects of a list have the keys of the first one, in its order, each once.
+def _keys_of_all(data: bytes, count: int) -> Collection[str]:
+    """Return the keys of the first object of a list if all objects have these keys, in one order, each once.
 
-    False may also be returned if they have. Without numbers, such objects are one text that is repeated.
+    Nothing may also be returned if they have. Without numbers, such objects are one text that is repeated.
     """
     first = data[data.find(b"{") : data.find(b"}") + 1]
     try:
-        keys = {key.encode().translate(None, NUMBER_BYTES) for key in load_json(first)}
-    except (DoubleKeyError, ValueError):
-        return False
+        keys: dict[str, Any] = load_json(first)
+    except ValueError:
+        return ()
     bare = first.translate(None, NUMBER_BYTES)
-    is_distinct = len(keys) == first.count(b":") and b"\\" not in first
-    return is_distinct and data.translate(None, NUMBER_BYTES) == bare * count
+    is_distinct = len({key.encode().translate(None, NUMBER_BYTES) for key in keys}) == first.count(b":")
+    return keys if is_distinct and b"\\" not in first and data.translate(None, NUMBER_BYTES) == bare * count else ()
 
 
-def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> list[Record]:
+def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> Batch[Record]:
     """Convert decoded JSON to typed records. Values of NaN, which Python's own json writes, are accepted.
 
     Raises
@@ -161,7 +192,7 @@ def convert_records(entries: list[Any], record: type[Record], expected: Expected
         expected value.
     """
     try:
-        return msgspec.convert(entries, list[record])  # type: ignore[valid-type]
+        return Batch(msgspec.convert(entries, list[record]), record.__struct_fields__)  # type: ignore[valid-type]
     except UnicodeEncodeError:  # a key holds half of a character, which msgspec cannot compare
         return convert_records(escape_surrogates(entries), record, expected, place)
     except msgspec.ValidationError as error:
@@ -209,7 +240,7 @@ def require_utf8(data: bytes) -> None:
     PredictionsError
     """
     try:
-        data.decode()
+        data.isascii() or data.decode()
     except UnicodeDecodeError as error:
         raise PredictionsError(f"byte {error.start} is not UTF-8 text") from None
 

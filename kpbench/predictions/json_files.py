@@ -21,7 +21,7 @@ from kpbench.predictions.decode import (
     json_type,
     parse_json,
     require_single_keys,
-    split_list,
+    split_lists,
 )
 from kpbench.predictions.fields import EXPECTED_IN_RECORD, SCHEMA, ImageRecord, make_header, parse_header
 from kpbench.types import Float, Int, InvalidValue, Predictions, offsets_of
@@ -43,10 +43,9 @@ def read_json(path: Path) -> Predictions:
         return f"predictions[{n}]"
 
     try:
-        frame, pieces = split_list(data, r'"predictions"\s*:\s*\[')
-        if isinstance(frame, dict) and frame.pop("predictions", None) == []:
-            batches = decode_records(pieces, ImageRecord, EXPECTED_IN_RECORD, place)
-            return _combine(batches, parse_header(frame), place)
+        frame, [pieces] = split_lists(data, "predictions")
+        batches = decode_records(pieces, ImageRecord, EXPECTED_IN_RECORD, place)
+        return _combine((batch.records for batch in batches), parse_header(frame), place)
     except (ValueError, RecursionError):
         pass  # the list cannot be split: decode the file at once, and find any fault
     content = parse_json(data, "the file")
@@ -56,7 +55,7 @@ def read_json(path: Path) -> Predictions:
     header = parse_header(content)
     if not isinstance(entries, list):
         raise PredictionsError(f"predictions is {json_type(entries)}, expected a list")
-    return _combine([convert_records(entries, ImageRecord, EXPECTED_IN_RECORD, place)], header, place)
+    return _combine([convert_records(entries, ImageRecord, EXPECTED_IN_RECORD, place).records], header, place)
 
 
 def read_jsonl(path: Path) -> Predictions:
@@ -74,7 +73,7 @@ def read_jsonl(path: Path) -> Predictions:
             return decoder.decode(line)
         except (ValueError, RecursionError):
             entry = parse_json(line, f"line {n}")
-            return convert_records([entry], ImageRecord, EXPECTED_IN_RECORD, lambda _: f"line {n}")[0]
+            return convert_records([entry], ImageRecord, EXPECTED_IN_RECORD, lambda _: f"line {n}").records[0]
 
     def read_batches(file: BinaryIO) -> Iterator[list[ImageRecord]]:
         first = 2
