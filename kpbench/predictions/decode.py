@@ -83,9 +83,9 @@ _MARK = f"a list {os.urandom(16).hex()}"
 def _split_span(data: bytes, low: int, stop: int) -> Iterator[bytes]:
     view = memoryview(data)
     while cut := _NEXT.search(data, low + PIECE_BYTES, stop):
-        yield b"[%b]" % view[low : cut.start() + 1]
+        yield b"".join((b"[", view[low : cut.start() + 1], b"]"))
         low = cut.end()
-    yield b"[%b]" % view[low:stop]
+    yield b"".join((b"[", view[low:stop], b"]"))
 
 
 class Batch(NamedTuple, Generic[Record]):

@@ -21,7 +21,7 @@ from kpbench.scoring.metrics import (
     compute_ratios,
 )
 from kpbench.scoring.outcomes import Outcomes
-from kpbench.types import Int
+from kpbench.types import Float, Int
 
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)
 """Edges of the bins of radii, px. A bin holds low < radius <= high."""
@@ -109,10 +109,25 @@ class Group:
         return {**self.metrics, "counts": self.counts, "intervals": self.intervals}
 
 
+class _Ranked(NamedTuple):
+    """Values in rising order. All values are sorted once, and each group selects from the sorted values."""
+
+    row: Int
+    """Row of the keypoint or of the detection that has each value."""
+    value: Float
+
+    @classmethod
+    def of(cls, row: Int, value: Float) -> _Ranked:
+        order = np.argsort(value)
+        return cls(row[order], value[order])
+
+
 class _Units(NamedTuple):
     """The M units that groups consist of. A unit is an image, or the keypoints of one label in one image."""
 
     outcomes: Outcomes
+    ranked: tuple[_Ranked, _Ranked, _Ranked]
+    """The scores of all detections, and the errors of all matched keypoints in px and in radii."""
     sums: Int
     """Counts of each unit, of shape (M, 9), in the order of SUMS."""
     scene: Int
@@ -128,23 +143,24 @@ class _Units(NamedTuple):
         """Compute a group for each key. ``label`` (M,) holds each unit's index into ``keys``."""
         label_or_none = np.append(label, -1)  # a detection of unit -1 gets the last label, -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
-        labels = (label, label_or_none[self.of_truth], label_or_none[self.of_detection])
-        rows = [_rows_of_labels(part, len(keys)) for part in labels]
-        for key, units, truths, detections, shared in zip(keys, *rows, any_shared.tolist(), strict=True):
-            yield self._compute(key, units, truths, detections, shared)
+        scores, *errors = self.ranked
+        units = [self.of_detection[scores.row], *(self.of_truth[ranked.row] for ranked in errors)]
+        rows = [_rows_of_labels(part, len(keys)) for part in (label, *(label_or_none[unit] for unit in units))]
+        for key, shared, *rows_of_key in zip(keys, any_shared.tolist(), *rows, strict=True):
+            yield self._compute(key, shared, *rows_of_key)
 
-    def _compute(self, key: GroupKey, units: Int, truths: Int, detections: Int, shared: bool) -> Group:
+    def _compute(self, key: GroupKey, shared: bool, units: Int, *ranks: Int) -> Group:
+        """Compute the group of some units. ``ranks`` select its values of each of ``ranked``."""
         outcomes, settings = self.outcomes, self.outcomes.settings
         sums = self.sums[units]
         total = sums.sum(axis=0)
         ratios = compute_ratios(total, settings.matching)
         metrics = {name: None if np.isnan(value) else float(value) for name, value in ratios.items()}
-        hit = outcomes.matches.kind[detections] == MATCHED
         n: dict[str, Any] = dict(zip(SUMS, total.tolist(), strict=True))
-        score = outcomes.detections.score[detections]
+        score, *errors = (ranked.value[rank] for ranked, rank in zip(self.ranked, ranks, strict=True))
+        hit = outcomes.matches.kind[self.ranked[0].row[ranks[0]]] == MATCHED
         metrics["average_precision"] = compute_average_precision(score, hit, n["truths"])
-        matched = truths[outcomes.matched[truths]]
-        metrics |= compute_error_metrics(outcomes.matches.distance[matched], outcomes.truth_points.radius[matched])
+        metrics |= compute_error_metrics(*errors)
         scenes = sum_by_scene(sums, self.scene[units])
         intervals = bootstrap_intervals(
             scenes, lambda s: compute_ratios(s, settings.matching), settings.resamples, settings.seed
@@ -179,40 +195,47 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     """
     truth, n = outcomes.truth, len(outcomes.truth)
     image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image
+    matched = np.flatnonzero(outcomes.matched)
+    distance = outcomes.matches.distance[matched]
+    ranked = (
+        _Ranked(outcomes.ranking, outcomes.detections.score[outcomes.ranking]),
+        _Ranked.of(matched, distance),
+        _Ranked.of(matched, distance / outcomes.truth_points.radius[matched]),
+    )
     images = _Units(
-        outcomes, outcomes.image_sums, truth.scene_id, image_of_truth, image_of_detection, np.zeros(n, bool)
+        outcomes, ranked, outcomes.image_sums, truth.scene_id, image_of_truth, image_of_detection, np.zeros(n, bool)
     )
     yield from images.group([GroupKey()], np.zeros(n, np.int64))
 
     conditions, condition = np.unique(truth.condition, return_inverse=True)
     rungs, rung = np.unique(truth.rung, return_inverse=True)
-    codes, code = np.unique(condition * len(rungs) + rung, return_inverse=True)
+    codes, code = _number(condition * len(rungs) + rung)
     keys = [GroupKey(str(conditions[c // len(rungs)]) or None, _as_written(rungs[c % len(rungs)])) for c in codes]
     has_conditions = keys != [GroupKey()]
     if has_conditions:  # images without condition and rung would have the key of all images
         yield from (group for group in images.group(keys, code) if group.key != GroupKey())
 
-    patches, patch = np.unique(outcomes.truth_id, return_inverse=True)
+    patches, patch = _number(outcomes.truth_id)
     if len(patches) > 1:
-        of_image, of_patch, units = _divide_images(outcomes, patch, len(patches))
+        of_image, of_patch, units = _divide_images(images, patch, len(patches))
         if has_conditions:
-            codes, label = np.unique(code[of_image] * len(patches) + of_patch, return_inverse=True)
+            codes, label = _number(code[of_image] * len(patches) + of_patch)
             both = [keys[c // len(patches)]._replace(patch_id=int(patches[c % len(patches)])) for c in codes]
             groups = units.group(both, label)
             yield from (group for group in groups if group.key._replace(patch_id=None) != GroupKey())
         yield from units.group([GroupKey(patch_id=int(p)) for p in patches], of_patch)
 
     bin_of_truth = np.searchsorted(RADIUS_EDGES_PX, outcomes.truth_points.radius) - 1
-    bins, size = np.unique(bin_of_truth, return_inverse=True)
+    bins, size = _number(bin_of_truth)
     if len(bins) > 1:
-        _, of_size, units = _divide_images(outcomes, size, len(bins))
+        _, of_size, units = _divide_images(images, size, len(bins))
         edges = [(RADIUS_EDGES_PX[b], RADIUS_EDGES_PX[b + 1]) for b in bins]
         radii = [(low, None if np.isinf(high) else high) for low, high in edges]
         units = units._replace(shared=np.ones(len(of_size), bool))  # a false alarm has no radius
         yield from units.group([GroupKey(radius_px=span) for span in radii], of_size)
 
 
-def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, Int, _Units]:
+def _divide_images(images: _Units, label: Int, labels: int) -> tuple[Int, Int, _Units]:
     """Divide each image into units. A unit holds the keypoints of one label.
 
     If an image has a single unit, the detections in the image belong to this unit. Otherwise the detections belong to
@@ -229,15 +252,28 @@ def _divide_images(outcomes: Outcomes, label: Int, labels: int) -> tuple[Int, In
         Image and label of each unit.
     units : _Units
     """
-    n = len(outcomes.truth)
-    unit, of_truth = np.unique(outcomes.truth_points.image * labels + label, return_inverse=True)
+    outcomes, n = images.outcomes, len(images.sums)
+    unit, of_truth = _number(images.of_truth * labels + label)
     of_image, of_label = unit // labels, unit % labels
     shared = (np.bincount(of_image, minlength=n) > 1)[of_image]
     unit_of_image = np.full(n, -1)
     unit_of_image[of_image[~shared]] = np.flatnonzero(~shared)
-    of_detection = unit_of_image[outcomes.detections.image]
+    of_detection = unit_of_image[images.of_detection]
     sums = outcomes.sum_rows(of_truth, of_detection, len(unit))
-    return of_image, of_label, _Units(outcomes, sums, outcomes.truth.scene_id[of_image], of_truth, of_detection, shared)
+    scene = outcomes.truth.scene_id[of_image]
+    return of_image, of_label, _Units(outcomes, images.ranked, sums, scene, of_truth, of_detection, shared)
+
+
+def _number(values: Int) -> tuple[Int, Int]:
+    """Return the distinct values in rising order, and the index of each value among these, as ``np.unique`` does.
+
+    If the values lie close together, they are not sorted, which takes many times as long.
+    """
+    low, high = (int(values.min()), int(values.max())) if len(values) else (0, 0)
+    if high - low > 4 * len(values):
+        return np.unique(values, return_inverse=True)
+    is_there = np.bincount(values - low, minlength=1) > 0
+    return np.flatnonzero(is_there) + low, (np.cumsum(is_there) - 1)[values - low]
 
 
 def _rows_of_labels(label: Int, labels: int) -> list[Int]:

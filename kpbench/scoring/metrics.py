@@ -143,7 +143,7 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
     Parameters
     ----------
     score : ndarray of shape (D,), float64
-        Scores of the detections, in any order.
+        Scores of the detections, in rising order.
     hit : ndarray of shape (D,), bool
         Whether each detection is a match.
 
@@ -154,12 +154,9 @@ def count_above_thresholds(score: Float, hit: NDArray[np.bool_]) -> tuple[Float,
     matches, detections : ndarray of shape (K,), float64
         Number of matches, and number of detections, at or above each threshold.
     """
-    every, hits = np.sort(score), np.sort(score[hit])  # sorting values is several times faster than sorting indices
-    first = np.flatnonzero(np.append(True, np.diff(every) != 0)[: len(every)])[::-1]
-    threshold = every[first]
-    detections = (len(every) - first).astype(np.float64)
-    matches = (len(hits) - np.searchsorted(hits, threshold[::-1], side="left")[::-1]).astype(np.float64)
-    return threshold, matches, detections
+    first = np.flatnonzero(np.append(True, np.diff(score) != 0)[: len(score)])[::-1]
+    matches_from = np.cumsum(hit[::-1])[::-1]  # the number of matches from each detection on
+    return score[first], matches_from[first].astype(np.float64), (len(score) - first).astype(np.float64)
 
 
 def compute_average_precision(score: Float, hit: NDArray[np.bool_], truths: int) -> float | None:
@@ -178,19 +175,19 @@ def compute_average_precision(score: Float, hit: NDArray[np.bool_], truths: int)
     return float(np.sum(np.diff(matches, prepend=0.0) / truths * matches / detections)) if truths else None
 
 
-def compute_error_metrics(distance: Float, radius: Float) -> dict[str, float | None]:
+def compute_error_metrics(error_px: Float, error_radii: Float) -> dict[str, float | None]:
     """Compute the median, the 95th percentile and the RMS of errors, in px and in radii.
 
     Parameters
     ----------
-    distance : ndarray of shape (M,), float64
-        Distance of each matched keypoint to its detection, px.
-    radius : ndarray of shape (M,), float64
-        Radius of each matched keypoint, px.
+    error_px : ndarray of shape (M,), float64
+        Distance of each matched keypoint to its detection, px, in rising order. The order of the images would otherwise
+        change the last bit of the RMS.
+    error_radii : ndarray of shape (M,), float64
+        The same distances in radii of the keypoints, in rising order.
     """
     metrics: dict[str, float | None] = {}
-    for unit, error in (("px", distance), ("radii", distance / radius)):
-        error = np.sort(error)  # so that the order of images does not change the last bit of the RMS
+    for unit, error in (("px", error_px), ("radii", error_radii)):
         some = len(error) > 0
         median, p95 = np.percentile(error, [50, 95]).tolist() if some else (None, None)
         metrics[f"error_median_{unit}"], metrics[f"error_p95_{unit}"] = median, p95

@@ -118,6 +118,11 @@ class Outcomes:
         """The counts of each image, of shape (N, 9), in the order of :data:`kpbench.scoring.SUMS`."""
         return self.sum_rows(self.truth_points.image, self.detections.image, len(self.truth))
 
+    @cached_property
+    def ranking(self) -> Int:
+        """The rows of the detections in rising order of the score, of shape (D,)."""
+        return np.argsort(self.detections.score)
+
     def sum_rows(self, row_of_truth: Int, row_of_detection: Int, rows: int) -> Int:
         """Count true keypoints, detections and their outcomes per row. The caller defines the rows, such as images.
 

@@ -172,7 +172,9 @@ def _count_confusions(outcomes: Outcomes) -> dict[str, Any]:
 def _trace_curve(outcomes: Outcomes) -> dict[str, list[float | None]]:
     """Return :attr:`Scores.curve`."""
     truths = len(outcomes.truth_id)
-    threshold, matches, detections = count_above_thresholds(outcomes.detections.score, outcomes.matches.kind == MATCHED)
+    rows = outcomes.ranking
+    hit = outcomes.matches.kind[rows] == MATCHED
+    threshold, matches, detections = count_above_thresholds(outcomes.detections.score[rows], hit)
     points = CURVE_POINTS if len(threshold) else 0
     rows = np.unique(np.linspace(0, len(threshold) - 1, points).astype(int))
     threshold, matches, detections = threshold[rows], matches[rows], detections[rows]
