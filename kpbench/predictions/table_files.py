@@ -51,8 +51,8 @@ def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], pl
     PredictionsError
         At the first row with a fault.
     """
-    values = np.stack([table[name].astype(np.float64) for name in TABLE_COLUMNS[1:] if name in table], axis=1)
-    rows = np.flatnonzero(~np.isnan(values).all(axis=1))
+    blank = np.logical_and.reduce([np.isnan(table[name]) for name in TABLE_COLUMNS[1:] if name in table])
+    rows = np.flatnonzero(~blank)
     for name in TABLE_COLUMNS[1:]:
         column = table[name][rows] if name in table else np.zeros(0)
         valid = np.isfinite(column)
