@@ -135,6 +135,7 @@ def open_coco(path: str | Path) -> CocoDataset:
         fingerprint = info.get("fingerprint") if isinstance(info, dict) else None
         if not isinstance(fingerprint, str) or not fingerprint:
             fingerprint = hashlib.sha256(data).hexdigest()
+        del data  # its memory is used again
         truth = _make_truth(images, annotations, fingerprint)
         files = tuple(images["file_name"].tolist())
         _warn_of_orientation(path, images)
