@@ -554,3 +554,47 @@ def test_blank_lines_at_the_end_of_a_csv_are_left_out(tmp_path):
     path.write_text("image_id,x,y\n0,1,2\n\n1,,\n")
     with pytest.raises(PredictionsError, match="line 3 has 0 values, expected 3"):
         read_predictions(path)
+
+
+# --- Long lists in pieces ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 30, 10**6])
+@pytest.mark.parametrize("indent", [None, 1])
+@pytest.mark.parametrize("names", [("one", "two"), ("two", "one")])
+def test_long_lists_are_split_in_any_order(monkeypatch, size, indent, names):
+    monkeypatch.setattr(decode, "PIECE_BYTES", size)
+    lists = {"one": [{"a": 1}, {"b": {"c": [2]}, "d": "x"}, {}], "two": [{"image_id": 3, "l": [[]]}]}
+    rest = {"first": [], "middle": [{"x": 1}], "last": "]"}
+    content = {"first": [], names[0]: lists[names[0]], "middle": [{"x": 1}], names[1]: lists[names[1]], "last": "]"}
+    frame, found = decode.split_lists(json.dumps(content, indent=indent).encode(), "one", "two")
+    assert [[r for piece in pieces for r in json.loads(piece)] for pieces in found] == list(lists.values())
+    assert frame == rest
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b'{"x": {"one": [{"a": 1}]}, "one": []}',
+        b'{"x": {"one": [{"a": 1}]}, "one": [{"a": 2}]}',
+        b'{"one": [{"a": 1}], "one": [{"a": 2}]}',
+        b'{"one": [{"a": [{"b": 1}]}]}',
+        b'{"one": [{"s": "}]"}]}',
+        b'{"one": [{"s": "}, {"}]}',
+        b'{"one": [{"a": 1}\f,{"a": 2}]}',
+        b'{"one": [{"a": 1}\f]}',
+        b'{"one": [{"a": 1}]]}',
+        b'{"one": [{"a": 1}',
+        b'[{"a": 1}]',
+        b'{"one": []}',
+    ],
+)
+def test_a_list_that_is_elsewhere_or_cannot_be_split_is_never_taken(monkeypatch, text):
+    monkeypatch.setattr(decode, "PIECE_BYTES", 1)
+
+    def read():
+        _, [pieces] = decode.split_lists(text, "one")
+        return [json.loads(piece) for piece in pieces]
+
+    with pytest.raises(ValueError):
+        read()
