@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -141,11 +141,12 @@ class _Units(NamedTuple):
 
     def group(self, keys: list[GroupKey], label: Int) -> Iterator[Group]:
         """Compute a group for each key. ``label`` (M,) holds each unit's index into ``keys``."""
-        label_or_none = np.append(label, -1)  # a detection of unit -1 gets the last label, -1
         any_shared = np.bincount(label, self.shared, minlength=len(keys)) > 0
-        scores, *errors = self.ranked
-        units = [self.of_detection[scores.row], *(self.of_truth[ranked.row] for ranked in errors)]
-        rows = [_rows_of_labels(part, len(keys)) for part in (label, *(label_or_none[unit] for unit in units))]
+        kind = np.int16 if len(keys) < 2**15 else np.int64  # numpy sorts integers of 16 bits in linear time
+        label_or_none = np.append(label, -1).astype(kind)  # a detection of unit -1 gets the last label, -1
+        parts = (self.of_detection, self.of_truth, self.of_truth)
+        labels = (label_or_none[part][ranked.row] for part, ranked in zip(parts, self.ranked, strict=True))
+        rows = [_rows_of_labels(part, len(keys)) for part in chain([label_or_none[:-1]], labels)]
         for key, shared, *rows_of_key in zip(keys, any_shared.tolist(), *rows, strict=True):
             yield self._compute(key, shared, *rows_of_key)
 
@@ -276,12 +277,10 @@ def _number(values: Int) -> tuple[Int, Int]:
     return np.flatnonzero(is_there) + low, (np.cumsum(is_there) - 1)[values - low]
 
 
-def _rows_of_labels(label: Int, labels: int) -> list[Int]:
+def _rows_of_labels(label: NDArray[Any], labels: int) -> list[Int]:
     """Return the rows of each label from 0 to ``labels`` - 1, in rising order. Rows of other labels are left out."""
-    if labels < 2**15:
-        label = label.astype(np.int16)  # numpy sorts integers of 16 bits in linear time
     order = np.argsort(label, kind="stable")
-    edges = np.searchsorted(label[order], np.arange(labels + 1))
+    edges = np.cumsum(np.bincount(label + 1, minlength=labels + 1))
     return [order[a:b] for a, b in pairwise(edges.tolist())]
 
 
