@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.predictions.decode import Batch
+from kpbench.predictions.decode import RecordBatch
 from kpbench.types import Float
 
 LARGEST_PX = 10**6
@@ -114,13 +114,13 @@ RESULT_COLUMNS: dict[str, tuple[type, Any]] = {
 """For each field but ``keypoints``, the type of its column, and the value that stands for null and for no value."""
 
 
-def make_columns(batches: Iterable[Batch[Any]], kinds: Mapping[str, tuple[type, Any]]) -> Columns:
+def make_columns(batches: Iterable[RecordBatch[Any]], kinds: Mapping[str, tuple[type, Any]]) -> Columns:
     """Make a column of each field of ``kinds``. The column ``keypoints`` has a row (x, y, v) per record.
 
     Columns of numbers hold inf in place of a given NaN.
     """
 
-    def column(batch: Batch[Any], name: str) -> NDArray[Any]:
+    def column(batch: RecordBatch[Any], name: str) -> NDArray[Any]:
         records, (kind, missing) = batch.records, kinds[name]
         if name not in batch.keys:
             return np.full(len(records), missing, kind)
@@ -133,7 +133,7 @@ def make_columns(batches: Iterable[Batch[Any]], kinds: Mapping[str, tuple[type, 
         given = [getattr(record, name) for record in records]
         return np.array([missing if v in (None, msgspec.UNSET) else v if v == v else np.inf for v in given], kind)
 
-    def points(batch: Batch[Any]) -> Float:
+    def points(batch: RecordBatch[Any]) -> Float:
         values = chain.from_iterable(map(attrgetter("keypoints"), batch.records))
         return np.fromiter(values, float, 3 * len(batch.records)).reshape(-1, 3)
 

@@ -89,7 +89,7 @@ def _split_span(data: bytes, low: int, stop: int) -> Iterator[bytes]:
     yield b"".join((b"[", view[low:stop], b"]"))
 
 
-class Batch(NamedTuple, Generic[Record]):
+class RecordBatch(NamedTuple, Generic[Record]):
     """Some typed records of a list."""
 
     records: list[Record]
@@ -99,7 +99,7 @@ class Batch(NamedTuple, Generic[Record]):
 
 def decode_records(
     pieces: Iterable[bytes], record: type[Record], expected: Expected, place: Place
-) -> Iterator[Batch[Record]]:
+) -> Iterator[RecordBatch[Record]]:
     """Decode the typed records of each piece of a list.
 
     Parameters
@@ -123,7 +123,7 @@ def decode_records(
     for piece in pieces:
         try:
             records: list[Record] = decoder.decode(piece)
-            batch = Batch(records, require_single_keys(piece, records, record))
+            batch = RecordBatch(records, require_single_keys(piece, records, record))
         except DoubleKeyError as error:
             raise PredictionsError(str(error)) from None
         except (ValueError, RecursionError):
@@ -143,7 +143,7 @@ def require_single_keys(data: bytes, records: Sequence[Record], record: type[Rec
     Returns
     -------
     collection of str
-        :attr:`Batch.keys`.
+        :attr:`RecordBatch.keys`.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def _keys_of_all(data: bytes, count: int) -> Collection[str]:
     return [key.decode() for key in keys]
 
 
-def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> Batch[Record]:
+def convert_records(entries: list[Any], record: type[Record], expected: Expected, place: Place) -> RecordBatch[Record]:
     """Convert decoded JSON to typed records. Values of NaN, which Python's own json writes, are accepted.
 
     Raises
@@ -192,7 +192,7 @@ def convert_records(entries: list[Any], record: type[Record], expected: Expected
         expected value.
     """
     try:
-        return Batch(msgspec.convert(entries, list[record]), record.__struct_fields__)  # type: ignore[valid-type]
+        return RecordBatch(msgspec.convert(entries, list[record]), record.__struct_fields__)  # type: ignore[valid-type]
     except UnicodeEncodeError:  # a key holds half of a character, which msgspec cannot compare
         return convert_records(escape_surrogates(entries), record, expected, place)
     except msgspec.ValidationError as error:

@@ -54,9 +54,7 @@ def perfect_predictions(dataset):
 
 
 def test_predictions_on_other_pixels_of_the_same_scenes_are_scored_with_a_warning(tmp_path, make_with):
-    here, there = (
-        make_with(version, generate, CONFIG, tmp_path / version).dataset for version in ("4.98.0", "4.99.0")
-    )
+    here, there = (make_with(version, generate, CONFIG, tmp_path / version).dataset for version in ("4.98.0", "4.99.0"))
     assert here.fingerprint != there.fingerprint
     with pytest.warns(KpbenchWarning, match="same scenes with other pixels"):
         scores = score(there.truth, perfect_predictions(here))
