@@ -14,7 +14,7 @@ import numpy as np
 from scipy import fft
 
 from kpbench.portable import exp
-from kpbench.types import Float, UInt8
+from kpbench.types import Float, Float32, UInt8
 
 BORDER_MODE = cv2.BORDER_REFLECT_101
 MOST_DIRECT_WEIGHTS = 129
@@ -77,11 +77,41 @@ def filter_separably(image: UInt8, taps: Float) -> UInt8:
     """
     if len(taps) > MOST_DIRECT_WEIGHTS:
         return filter_image(image, np.outer(taps, taps))
+    return _divide(_separable_sums(image, taps), 16 * SEPARABLE_UNIT)
+
+
+def filter_separably_exactly(image: UInt8, taps: Float) -> Float32:
+    """Return the weighted means of :func:`filter_separably` before they are rounded to levels.
+
+    Parameters
+    ----------
+    image : ndarray of shape (H, W) or (H, W, 3), uint8
+    taps : ndarray of shape (n,), n odd and at most 129
+        Weights; scaled to the sum 1.
+
+    Returns
+    -------
+    ndarray of the same shape, float32
+        Multiples of 2⁻¹⁶ grey level.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kpbench.filters import filter_separably_exactly
+    >>> filter_separably_exactly(np.array([[0, 0, 90, 1, 0]], np.uint8), np.array([1, 2, 1])).tolist()
+    [[0.0, 22.5, 45.25, 23.0, 0.5]]
+    """
+    if len(taps) > MOST_DIRECT_WEIGHTS:
+        raise ValueError(f"{len(taps)} weights, expected at most {MOST_DIRECT_WEIGHTS}")
+    return np.asarray(_separable_sums(image, taps) * np.float32(1 / (16 * SEPARABLE_UNIT)))
+
+
+def _separable_sums(image: UInt8, taps: Float) -> Any:
+    """Return whole multiples of ``1 / (16 * SEPARABLE_UNIT)`` grey level, float32."""
     weights = to_whole_weights(taps, SEPARABLE_UNIT).astype(np.float32)
     rows: Any = cv2.filter2D(image.astype(np.float32), -1, weights[None], borderType=BORDER_MODE)
     rows *= np.float32(16 / SEPARABLE_UNIT)
-    sums = cv2.filter2D(np.rint(rows, out=rows), -1, weights[:, None], borderType=BORDER_MODE)
-    return _divide(sums, 16 * SEPARABLE_UNIT)
+    return cv2.filter2D(np.rint(rows, out=rows), -1, weights[:, None], borderType=BORDER_MODE)
 
 
 def gaussian_taps(sigma_px: float) -> Float:

@@ -50,6 +50,7 @@ GROUND = {
 """What every stage shares, and what each of these modules may import."""
 ROOMS = {
     "geometry": [],
+    "camera": ["geometry"],
     "patches": ["geometry"],
     "printing": ["geometry", "patches"],
     "render": ["geometry", "patches"],

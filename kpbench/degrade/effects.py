@@ -18,7 +18,7 @@ import numpy as np
 
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
 from kpbench.images import encode_jpeg
-from kpbench.portable import cos_sin, exp, log, matmul
+from kpbench.portable import cos_sin, exp, log, matmul, normal_quantiles
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -35,15 +35,6 @@ glow's reach, and the intensity as a fraction of the glow's strength.
 def to_uint8(image: Any) -> UInt8:
     """Round grey levels and clip them to the range 0 to 255."""
     return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
-
-
-@lru_cache(maxsize=1)
-def _normal_quantiles() -> Float:
-    """Return 2¹⁶ equally likely values of the standard normal distribution, in ascending order, from -4.3 to 4.3."""
-    from scipy.special import ndtri
-
-    values = ndtri((np.arange(2**16) + 0.5) / 2**16)
-    return np.asarray(np.round(values / values.std(), 6))  # rounded to remove what depends on the processor
 
 
 def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
@@ -72,7 +63,7 @@ def noise(image: UInt8, rng: np.random.Generator, sigma: float) -> UInt8:
     """
     # pixels are whole numbers, so noise can be rounded before the addition; a uniform 16-bit number picks a rounded
     # quantile, which is quicker than a normal generator
-    levels = np.rint(sigma * _normal_quantiles()).astype(np.int16)
+    levels = np.rint(sigma * normal_quantiles()).astype(np.int16)
     draws = np.frombuffer(rng.bytes(2 * image.size), "<u2").astype(np.uint16, copy=False)
     field = cv2.LUT(draws.reshape(len(image), -1), levels)  # takes a third of the time of NumPy's indexing
     return np.asarray(cv2.add(image, field.reshape(image.shape), dtype=cv2.CV_8U), np.uint8)
