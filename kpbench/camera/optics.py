@@ -27,6 +27,9 @@ REACH_IN_AIRY_RADII = 3.24
 JINC_STEP, JINC_END, JINC_NODES = 1 / 64, 160.0, 224
 """Step and end of the table of 2 J₁(x) / x, and the number of nodes of its integral."""
 
+LARGEST_DEFOCUS_PX = 35.0
+"""Largest radius of the disc of defocus; with this radius, the table reaches the largest frequency, 0.71 per px."""
+
 
 @lru_cache(maxsize=1)
 def _jinc_table() -> Float:
@@ -101,6 +104,8 @@ def psf_kernel(
     >>> kernel.shape, float(kernel[2, 2].round(2))
     ((5, 5), 0.77)
     """
+    if not 0 <= defocus_px <= LARGEST_DEFOCUS_PX:
+        raise ValueError(f"defocus_px is {defocus_px:g}, expected 0 to {LARGEST_DEFOCUS_PX:g}")
     airy_unit_px = wavelength_um * f_number / pixel_um
     if reach_px is None:
         reach_px = max(1, int(np.ceil(REACH_IN_AIRY_RADII * airy_unit_px + defocus_px)))

@@ -1,4 +1,4 @@
-"""Tone curves against formulas that are written out here once more, and against scikit-like reference values."""
+"""Tone curves against formulas that are written out here once more."""
 
 import dataclasses
 import json
