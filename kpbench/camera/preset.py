@@ -1,0 +1,185 @@
+"""Cameras as TOML files: for each quantity a value, or a range from which every image draws its own value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kpbench.camera.tone import ToneCurve, random_tone_curve
+from kpbench.errors import DataError
+from kpbench.files import shipped_folder
+from kpbench.toml import TomlTable, name_source, read_toml
+
+CAMERA_SCHEMA = "kpbench.camera/1"
+TONES = ("linear", "srgb", "s-curve", "gamma", "logarithmic", "random")
+"""Tone curves of a preset. "s-curve", "gamma" and "logarithmic" take ``tone_parameter``; "random" draws a curve."""
+QUANTITIES: dict[str, dict[str, tuple[float, float, float]]] = {
+    "lens": {
+        "wavelength_um": (0.0, 20.0, 0.55),
+        "f_number": (0.5, 64.0, 2.8),
+        "pixel_um": (0.3, 100.0, 3.0),
+        "defocus_px": (0.0, 35.0, 0.0),
+        "corner_loss": (0.0, 1.0, 0.0),
+    },
+    "sensor": {
+        "full_well_e": (10.0, 1e6, 10_000.0),
+        "exposure": (1e-4, 16.0, 1.0),
+        "read_noise_e": (0.0, 1000.0, 2.0),
+        "prnu": (0.0, 0.5, 0.0),
+        "dsnu_e": (0.0, 1000.0, 0.0),
+        "row_noise_e": (0.0, 1000.0, 0.0),
+        "bits": (6, 14, 10),
+    },
+    "processing": {
+        "balance_error": (0.0, 0.5, 0.0),
+        "tone_parameter": (0.01, 10_000.0, 2.2),
+        "denoise_sigma": (0.0, 50.0, 0.0),
+        "sharpen_amount": (0.0, 10.0, 0.0),
+        "sharpen_sigma_px": (0.3, 10.0, 1.0),
+        "jpeg_quality": (0, 100, 0),
+    },
+}
+"""Least value, greatest value and default of each quantity of each table of a camera's file."""
+WHOLE = ("bits", "jpeg_quality")
+
+
+@dataclass(frozen=True)
+class CameraPreset:
+    """A camera, and how its images differ.
+
+    Attributes
+    ----------
+    name : str
+    spans : tuple of (str, (float, float))
+        Least and greatest value of each quantity of :data:`QUANTITIES`. Each image draws its value uniformly.
+    tones : tuple of str
+        Tone curves, see :data:`TONES`. Each image draws one of them.
+    has_bayer_pattern : bool
+        Whether the sensor of a colour image has colour filters.
+    camera_seed : int
+        Identity of the camera, which fixes the fixed pattern of the sensor.
+
+    Examples
+    --------
+    >>> from kpbench.camera import load_camera_preset
+    >>> preset = load_camera_preset("webcam")
+    >>> preset.name, preset.has_bayer_pattern
+    ('webcam', True)
+    """
+
+    name: str
+    spans: tuple[tuple[str, tuple[float, float]], ...]
+    tones: tuple[str, ...]
+    has_bayer_pattern: bool
+    camera_seed: int = 0
+
+    def draw(self, rng: np.random.Generator) -> dict[str, Any]:
+        """Draw the values of one image.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+
+        Returns
+        -------
+        dict
+            The record of the effect ``camera``, for :func:`kpbench.camera.photograph`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from kpbench.camera import load_camera_preset
+        >>> record = load_camera_preset("industrial").draw(np.random.default_rng(0))
+        >>> record["effect"], record["tone"]
+        ('camera', {'name': 'linear', 'parameters': []})
+        """
+        drawn: dict[str, Any] = {"effect": "camera", "preset": self.name, "camera_seed": self.camera_seed}
+        for name, (low, high) in self.spans:
+            value = low + (high - low) * float(rng.random())
+            drawn[name] = round(value) if name in WHOLE else round(value, 4)
+        error = drawn.pop("balance_error")
+        drawn["balance"] = [round(1 + error * float(rng.uniform(-1, 1)), 4) for _ in ("red", "blue")]
+        curve = self._draw_tone(rng, drawn.pop("tone_parameter"))
+        drawn["tone"] = {"name": curve.name, "parameters": list(curve.parameters)}
+        return drawn | {"bayer": self.has_bayer_pattern}
+
+    def _draw_tone(self, rng: np.random.Generator, parameter: float) -> ToneCurve:
+        name = self.tones[int(rng.integers(len(self.tones)))]
+        if name == "random":
+            return random_tone_curve(rng)
+        return ToneCurve(name, () if name in ("linear", "srgb") else (parameter,))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the preset for the config of a dataset."""
+        spans = {name: low if low == high else [low, high] for name, (low, high) in self.spans}
+        return {
+            "name": self.name,
+            **spans,
+            "tone": list(self.tones),
+            "bayer": self.has_bayer_pattern,
+            "camera_seed": self.camera_seed,
+        }
+
+
+def shipped_cameras() -> dict[str, Path]:
+    """Return the files of the cameras that ship with kpbench, keyed by the cameras' names.
+
+    Examples
+    --------
+    >>> from kpbench.camera import shipped_cameras
+    >>> list(shipped_cameras())
+    ['action-cam', 'industrial', 'phone', 'webcam']
+    """
+    return {path.stem: path for path in sorted(shipped_folder("cameras").glob("*.toml"))}
+
+
+def load_camera_preset(name: str) -> CameraPreset:
+    """Read a camera.
+
+    Parameters
+    ----------
+    name : str
+        Name of a shipped camera, or path of a TOML file.
+
+    Raises
+    ------
+    DataError
+        If there is no such camera, or a value in its file is wrong. The message names the file, the key and the
+        expected value.
+
+    Examples
+    --------
+    >>> from kpbench.camera import load_camera_preset
+    >>> load_camera_preset("phone").tones
+    ('s-curve', 'random')
+    """
+    shipped = shipped_cameras()
+    path = shipped.get(name, Path(name))
+    if name not in shipped and path.suffix != ".toml":
+        raise DataError(f"there is no camera {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+    content = read_toml(path, DataError)
+    with name_source(path, DataError):
+        return _parse_preset(TomlTable(content, ("schema", "name", "seed", *QUANTITIES), DataError))
+
+
+def _parse_preset(table: TomlTable) -> CameraPreset:
+    table.require_schema(CAMERA_SCHEMA)
+    spans: list[tuple[str, tuple[float, float]]] = []
+    tones: tuple[str, ...] = ("srgb",)
+    has_bayer_pattern = False
+    for part, quantities in QUANTITIES.items():
+        more = {"sensor": ("bayer",), "processing": ("tone",)}.get(part, ())
+        entries = table.table(part, (*quantities, *more), {})
+        for name, (low, high, default) in quantities.items():
+            spans.append((name, entries.span(name, low, high) if name in entries else (default, default)))
+        if "bayer" in entries and part == "sensor":
+            has_bayer_pattern = entries.flag("bayer")
+        if "tone" in entries and part == "processing":
+            tones = tuple(map(str, entries.entries("tone", "a list of tone curves")))
+            if unknown := [tone for tone in tones if tone not in TONES]:
+                raise DataError(f"processing.tone names {unknown[0]!r}, expected some of: {', '.join(TONES)}")
+    seed = table.whole_number("seed", 0, 2**31) if "seed" in table else 0
+    return CameraPreset(table.name(), tuple(spans), tones, has_bayer_pattern, seed)
