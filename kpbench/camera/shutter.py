@@ -13,6 +13,7 @@ Truth is the pose at the middle of the exposure of the row on which the centre f
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -29,11 +30,17 @@ from kpbench.types import Float
 
 MovingMap = Callable[[Float, Float], Float]
 """A map from points (N, 2) and times (N,), in exposures, to image points (N, 2), px."""
+NODES = 0.5 * np.array([-0.9510565162951535, -0.5877852522924731, 0.0, 0.5877852522924731, 0.9510565162951535])
+"""Chebyshev nodes of the exposure. The path of each point is the polynomial of degree 4 through its places at these
+times. For a turn by 20 degrees per exposure, its error is below 1e-6 of the distance from the axis; for a turn by 90
+degrees, it is below 2e-4."""
 SUB_EXPOSURES_PER_PX = 2.0
 """Number of instants per px of the longest path during an exposure."""
 MOST_SUB_EXPOSURES = 1024
 ROW_ERROR_PX = 1e-10
 """Error of the row on which a point appears, px."""
+DRAWN_ROW_ERROR_PX = 1e-5
+"""The same for the vertices of outlines that are drawn, px."""
 STEEPEST_SLOPE = -0.05
 """Where an image moves along the columns at more than 0.95 of the speed of the rolling shutter, rows are not found."""
 ROW_STEPS = 50
@@ -71,7 +78,9 @@ class Shutter:
         """Return the time at the middle of the exposure of row y, in exposures."""
         return self.start + self.row_time * y
 
-    def expose(self, moving_map: MovingMap, points: Float, instants: ArrayLike = 0.0) -> Float:
+    def expose(
+        self, moving_map: MovingMap, points: Float, instants: ArrayLike = 0.0, error_px: float = ROW_ERROR_PX
+    ) -> Float:
         """Return where points appear in the image.
 
         The row of each point solves ``y = Y(point, time(y) + instant)``. The method is the secant method, starting
@@ -83,6 +92,8 @@ class Shutter:
         points : ndarray of shape (N, 2)
         instants : float or ndarray of shape (N,)
             Instants within the exposure, from -0.5 to 0.5.
+        error_px : float
+            Largest error of the row, px.
 
         Returns
         -------
@@ -104,7 +115,7 @@ class Shutter:
         for _ in range(ROW_STEPS):
             image = moving_map(points, instant + self.start + self.row_time * y)
             error = image[:, 1] - y
-            moves = np.abs(error) > ROW_ERROR_PX
+            moves = np.abs(error) > error_px
             if not moves.any():
                 return image
             slope = np.divide(error - error0, y - y0, out=np.full(len(y), -1.0), where=moves & (y != y0))
@@ -155,8 +166,10 @@ class PatchMotion:
         def move(points: Float, times: Float) -> Float:
             x, y = (project(H_patch2image, points) - centre).T
             if self.turn_deg or self.growth:
-                scale = exp(self.growth * times)
-                c, s = (scale * value for value in cos_sin(np.radians(self.turn_deg) * times))
+                c, s = cos_sin(np.radians(self.turn_deg) * times)
+                if self.growth:
+                    scale = exp(self.growth * times)
+                    c, s = scale * c, scale * s
                 x, y = c * x - s * y, s * x + c * y
             vx, vy = self.velocity_px
             moved = np.column_stack([centre[0] + x + vx * times, centre[1] + y + vy * times])
@@ -254,13 +267,31 @@ def sub_exposures(moving_map: MovingMap, points: Float, shutter: Shutter) -> Flo
     >>> sub_exposures(move, np.zeros((1, 2)), Shutter()).tolist()
     [-0.375, -0.125, 0.125, 0.375]
     """
-    steps = np.linspace(-0.5, 0.5, 5)
-    places = shutter.expose(moving_map, np.tile(points, (5, 1)), np.repeat(steps, len(points)))
-    step = np.diff(places.reshape(5, -1, 2), axis=0)
-    path_px = float(np.sqrt((step * step).sum(axis=2)).sum(axis=0).max(initial=0.0))
+    return _instants(_places_at_nodes(moving_map, points, shutter))
+
+
+def _places_at_nodes(moving_map: MovingMap, points: Float, shutter: Shutter) -> Float:
+    """Return the image points, shape (5, N, 2), of points at ``NODES``."""
+    times = np.repeat(NODES, len(points))
+    return shutter.expose(moving_map, np.tile(points, (5, 1)), times, DRAWN_ROW_ERROR_PX).reshape(5, -1, 2)
+
+
+def _instants(places: Float) -> Float:
+    """Return the instants for image points at ``NODES``, shape (5, N, 2)."""
+    step = np.diff(places, axis=0)
+    between = float(np.sqrt((step * step).sum(axis=2)).sum(axis=0).max(initial=0.0))
+    path_px = between / (NODES[-1] - NODES[0])
     # rounding must not add an instant to a path of a whole number of half px
-    count = min(max(1, int(np.ceil(SUB_EXPOSURES_PER_PX * path_px - 1e-6))), MOST_SUB_EXPOSURES)
+    count = min(max(1, int(np.ceil(SUB_EXPOSURES_PER_PX * path_px - 1e-4))), MOST_SUB_EXPOSURES)
     return (np.arange(count) + 0.5) / count - 0.5
+
+
+def _interpolate(places: Float, instants: Float) -> Float:
+    """Return places at instants, shape (K, N, 2), from places at ``NODES``, by Lagrange's formula."""
+    weights = np.ones((len(instants), 5))
+    for i, j in itertools.permutations(range(5), 2):
+        weights[:, i] *= (instants - NODES[j]) / (NODES[i] - NODES[j])
+    return matmul(weights, places.reshape(5, -1)).reshape(len(instants), *places.shape[1:])
 
 
 def rasterise_moving(
@@ -299,23 +330,26 @@ def rasterise_moving(
     >>> from kpbench.camera.shutter import PatchMotion, rasterise_moving
     >>> square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 1.0], [0.0, 1.0]]) - 0.5
     >>> [(box, cover)] = rasterise_moving([[square]], PatchMotion((2.0, 0.0)).of_patch(np.eye(3)))
-    >>> cover[1].tolist()
+    >>> cover.sum(axis=0).round(6).tolist()
     [0.0, 0.25, 0.75, 1.0, 1.0, 0.75, 0.25, 0.0]
     """
     shutter = shutter or Shutter()
     points, next_vertex = join_polygons([polygon for region in regions for polygon in region])
     owner = np.repeat(np.arange(len(regions)), [sum(map(len, region)) for region in regions])
-    instants = sub_exposures(moving_map, points, shutter)
-    finer, following, edge = subdivide(points, next_vertex, lambda p: shutter.expose(moving_map, p), tolerance_px)
-    count, total = len(instants), len(finer)
-    places = shutter.expose(moving_map, np.tile(finer, (count, 1)), np.repeat(instants, total)).reshape(count, total, 2)
-    owner = owner.take(edge)
+    finer, following, edge = subdivide(
+        points, next_vertex, lambda p: shutter.expose(moving_map, p, 0.0, DRAWN_ROW_ERROR_PX), tolerance_px
+    )
+    at_nodes = _places_at_nodes(moving_map, finer, shutter)
+    places = _interpolate(at_nodes, _instants(at_nodes))
+    count, owner = len(places), owner.take(edge)
+    low, high = places.min(axis=0), places.max(axis=0)
     if same_box:
-        boxes = [bounding_box([places.reshape(-1, 2)])] * len(regions)
+        boxes = [bounding_box([low, high])] * len(regions)
     else:
-        boxes = [bounding_box([places[:, owner == n].reshape(-1, 2)]) for n in range(len(regions))]
+        boxes = [bounding_box([low[owner == n], high[owner == n]]) for n in range(len(regions))]
     ends = places.take(following, axis=1)
-    covers = rasterise_edges(places.reshape(-1, 2).T, ends.reshape(-1, 2).T, np.tile(owner, count), boxes, layers=count)
+    start, end = (np.ascontiguousarray(corner.reshape(-1, 2).T) for corner in (places, ends))
+    covers = rasterise_edges(start, end, np.tile(owner, count), boxes, [count] * len(boxes))
     return list(zip(boxes, covers, strict=True))
 
 

@@ -86,7 +86,7 @@ def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[
 
 
 def rasterise_edges(
-    start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box], layers: int = 1
+    start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box], layers: Sequence[int] = ()
 ) -> list[Float]:
     """Return the covered fractions as :func:`rasterise` does, for regions given by their edges.
 
@@ -98,9 +98,10 @@ def rasterise_edges(
         Index of each edge's region, and of the region's box in ``boxes``. The edges of a region form closed polygons.
     boxes : sequence of (int, int, int, int)
         As in :func:`rasterise`.
-    layers : int
+    layers : sequence of int
         Number of copies of each region among the edges, such as the places of a region that moves. The result is the
-        mean of the copies' covered fractions. The outer polygons of all copies run in one direction.
+        mean of the copies' covered fractions. The outer polygons of all copies run in one direction. Empty: one copy
+        of each region.
     """
     x, y, width, height = np.array(boxes, np.int64).reshape(-1, 4).T
     base = np.concatenate([[0], np.cumsum(width * height)])
@@ -109,8 +110,8 @@ def rasterise_edges(
     # a region's entries sum to zero, so one running sum serves all regions; outer polygons may run in either direction,
     # so the sum may be negative
     covered = np.cumsum(signed)
-    if layers > 1:
-        covered /= layers
+    for n, count in enumerate(layers):
+        covered[base[n] : base[n + 1]] *= 1 / count
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
     return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
 

@@ -12,10 +12,12 @@ from kpbench.geometry.homography import project_disc_sizes
 from kpbench.geometry.warp import PointMap
 from kpbench.patches.design import unit_polygons
 from kpbench.render.placement import Placement
-from kpbench.render.scene import Mask, inked_polygons
+from kpbench.render.scene import Mask, inked_polygons, rasterise_patches
 
 STILL = PatchMotion()
 """No motion."""
+BLURRED_TOLERANCE_PX = 4e-3
+"""Largest distance between a drawn edge and the true edge of a patch that moves, px."""
 
 
 def expose_patches(
@@ -24,7 +26,7 @@ def expose_patches(
     shutter: Shutter | None = None,
     warp: PointMap | None = None,
     ink_gain: float = 0.0,
-    tolerance_px: float = 1e-3,
+    tolerance_px: float = BLURRED_TOLERANCE_PX,
 ) -> list[Mask]:
     """Compute which fraction of each pixel each patch covers, as a mean over the exposure.
 
@@ -59,6 +61,9 @@ def expose_patches(
     """
     masks = []
     for placement, motion in zip(placements, motions, strict=True):
+        if motion == STILL:
+            masks += rasterise_patches([placement], min(tolerance_px, 1e-3), warp, ink_gain)
+            continue
         H, patch = placement.H_patch2image, placement.patch
         _, major, _ = project_disc_sizes(H[None])
         tolerance = float(np.ldexp(0.5, np.frexp(tolerance_px / major[0])[1]))
