@@ -50,9 +50,9 @@ GROUND = {
 """What every stage shares, and what each of these modules may import."""
 ROOMS = {
     "geometry": [],
+    "camera": ["geometry"],
     "patches": ["geometry"],
     "printing": ["geometry", "patches"],
-    "camera": ["geometry"],
     "render": ["geometry", "patches", "camera"],
     "degrade": ["geometry"],
     "dataset": ["geometry"],
