@@ -53,7 +53,7 @@ ROOMS = {
     "camera": ["geometry"],
     "patches": ["geometry"],
     "printing": ["geometry", "patches"],
-    "render": ["geometry", "patches"],
+    "render": ["geometry", "patches", "camera"],
     "degrade": ["geometry"],
     "dataset": ["geometry"],
     "synth": ["geometry", "patches", "render", "degrade", "dataset"],

@@ -1,12 +1,14 @@
-"""A pinhole camera with OpenCV's lens distortion."""
+"""A pinhole camera with a lens that distorts as OpenCV's models do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kpbench.geometry.lens import Lens, LensModel
 from kpbench.portable import cos_sin, matmul
 from kpbench.types import Float
 
@@ -30,15 +32,10 @@ NO_DISTORTION = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera whose principal point is the centre of the image.
+    """A pinhole camera with a lens.
 
-    A point (X, Y, Z) of the camera frame has the ray (x, y) = (X / Z, Y / Z). :meth:`distort` first applies the
-    model of Brown (1966) in OpenCV's form to the ray, with ``r² = x² + y²``::
-
-        x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
-        y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p2 x y + p1 (r² + 2 y²)
-
-    The intrinsic matrix :attr:`K` then maps (x', y') to px.
+    A point (X, Y, Z) of the camera frame has the ray (x, y) = (X / Z, Y / Z). :class:`kpbench.geometry.lens.Lens`
+    describes how the lens moves the ray to (x', y'). The intrinsic matrix :attr:`K` then maps (x', y') to px.
 
     Attributes
     ----------
@@ -46,8 +43,13 @@ class Camera:
         Size of the image.
     focal_px : float
         Focal length in px.
-    distortion : tuple of 5 float
-        OpenCV's (k1, k2, p1, p2, k3). All are zero for a camera without distortion.
+    distortion : tuple of float
+        OpenCV's coefficients, see :class:`kpbench.geometry.lens.Lens`. For the model ``brown``, 0, 4, 5, 8 or 12
+        numbers; all are zero for a camera without distortion. For the model ``fisheye``, 4 numbers.
+    model : {"brown", "fisheye"}
+        Model of the lens.
+    principal_px : (float, float), optional
+        The principal point, px. None: the centre of the image.
 
     Examples
     --------
@@ -61,13 +63,29 @@ class Camera:
     width_px: int
     height_px: int
     focal_px: float
-    distortion: tuple[float, float, float, float, float] = NO_DISTORTION
+    distortion: tuple[float, ...] = NO_DISTORTION
+    model: LensModel = "brown"
+    principal_px: tuple[float, float] | None = None
 
     @property
     def K(self) -> Float:
         """Intrinsic matrix from the camera frame to px, ndarray of shape (3, 3)."""
-        cx, cy = (self.width_px - 1) / 2, (self.height_px - 1) / 2
+        cx, cy = self.principal_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
         return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
+
+    @cached_property
+    def lens(self) -> Lens:
+        """The lens."""
+        return Lens(self.model, self.distortion)
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether the lens bends straight lines."""
+        return self.model == "fisheye" or any(self.distortion)
+
+    def without_distortion(self) -> Camera:
+        """Return the same camera with a lens that keeps straight lines straight."""
+        return replace(self, distortion=NO_DISTORTION, model="brown")
 
     def project(self, points_camera: ArrayLike) -> Float:
         """Return the image points (N, 2), px, of points (N, 3) in the camera frame. Every z must be positive."""
@@ -76,27 +94,24 @@ class Camera:
 
     def distort(self, rays: Float) -> Float:
         """Return the image points (N, 2), px, of rays (x, y), shape (N, 2)."""
-        k1, k2, p1, p2, k3 = self.distortion
-        x, y = np.asarray(rays, np.float64).T
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return np.asarray(self.focal_px * np.column_stack([xd, yd]) + self.K[:2, 2])
+        return np.asarray(self.focal_px * self.lens.distort(rays) + self.K[:2, 2])
+
+    def undistort(self, points_px: ArrayLike) -> Float:
+        """Return the rays (x, y), shape (N, 2), of image points (N, 2), px. The inverse of :meth:`distort`.
+
+        Raises
+        ------
+        ValueError
+            If a point lies outside the valid region of the lens, see :meth:`kpbench.geometry.lens.Lens.undistort`.
+        """
+        return self.lens.undistort((np.asarray(points_px, np.float64) - self.K[:2, 2]) / self.focal_px)
 
     def local_K(self, ray: ArrayLike) -> Float:
         """Return the matrix, shape (3, 3), that equals :meth:`distort` to first order near one ray.
 
         If the camera has no distortion, the matrix is ``K`` for every ray.
         """
-        k1, k2, p1, p2, k3 = self.distortion
         x, y = np.asarray(ray, np.float64)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / dx is x * slope, d radial / dy is y * slope
-        J = self.focal_px * np.array([
-            [radial + x * x * slope + 2 * p1 * y + 6 * p2 * x, x * y * slope + 2 * p1 * x + 2 * p2 * y],
-            [x * y * slope + 2 * p1 * x + 2 * p2 * y, radial + y * y * slope + 6 * p1 * y + 2 * p2 * x],
-        ])  # fmt: skip
-        point = self.distort(np.array([[x, y]]))[0]
+        rays = np.array([[x, y]])
+        J, point = self.focal_px * self.lens.jacobian(rays)[0], self.distort(rays)[0]
         return np.vstack([np.column_stack([J, point - (J[:, 0] * x + J[:, 1] * y)]), [0.0, 0.0, 1.0]])

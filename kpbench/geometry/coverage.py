@@ -85,7 +85,9 @@ def rasterise(regions: Sequence[Sequence[Float]], boxes: Sequence[Box]) -> list[
     return rasterise_edges(np.concatenate(polygons).T, np.concatenate(ends).T, owner, boxes)
 
 
-def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box]) -> list[Float]:
+def rasterise_edges(
+    start: Float, end: Float, owner: NDArray[np.int64], boxes: Sequence[Box], layers: Sequence[int] = ()
+) -> list[Float]:
     """Return the covered fractions as :func:`rasterise` does, for regions given by their edges.
 
     Parameters
@@ -96,6 +98,10 @@ def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: S
         Index of each edge's region, and of the region's box in ``boxes``. The edges of a region form closed polygons.
     boxes : sequence of (int, int, int, int)
         As in :func:`rasterise`.
+    layers : sequence of int
+        Number of copies of each region among the edges, such as the places of a region that moves. The result is the
+        mean of the copies' covered fractions. The outer polygons of all copies run in one direction. Empty: one copy
+        of each region.
     """
     x, y, width, height = np.array(boxes, np.int64).reshape(-1, 4).T
     base = np.concatenate([[0], np.cumsum(width * height)])
@@ -104,6 +110,8 @@ def rasterise_edges(start: Float, end: Float, owner: NDArray[np.int64], boxes: S
     # a region's entries sum to zero, so one running sum serves all regions; outer polygons may run in either direction,
     # so the sum may be negative
     covered = np.cumsum(signed)
+    for n, count in enumerate(layers):
+        covered[base[n] : base[n + 1]] *= 1 / count
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
     return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
 

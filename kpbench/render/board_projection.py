@@ -6,13 +6,13 @@ The experiments fix the share of the image that the board covers. This share det
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
 
 from kpbench.errors import DataError
-from kpbench.geometry.camera import NO_DISTORTION, Camera, plane_to_camera, rotation_xyz
+from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
 from kpbench.geometry.outline import flatten, rectangle
 from kpbench.patches.board import BoardLike
 from kpbench.portable import exp, log, matmul
@@ -74,7 +74,7 @@ def project_outline(camera: Camera, pose: Pose, board: BoardLike, inset_mm: floa
 
 def project_polygon(camera: Camera, pose: Pose, polygon_mm: Float) -> Float:
     """Project a polygon on the board into the image. If the lens bends lines, cut the edges into short pieces."""
-    if not any(camera.distortion):
+    if not camera.is_bent:
         return project_to_image(camera, pose, polygon_mm)
     edge_mm = np.roll(polygon_mm, -1, axis=0) - polygon_mm
     end_px = project_to_image(camera, pose, np.roll(polygon_mm, -1, axis=0))
@@ -164,8 +164,8 @@ def _find_depth(camera: Camera, board: BoardLike, R: Float, ray: Float, area_px:
     frontal_mm = camera.focal_px * np.sqrt(board.side_x_mm * board.side_y_mm / area_px)
     nearest_mm = max(-matmul(corners, R.T)[:, 2].min() * 1.001, 0.05 * frontal_mm)
     try:
-        depth_mm = solve(replace(camera, distortion=NO_DISTORTION), nearest_mm, 4 * frontal_mm)
-        if not any(camera.distortion):
+        depth_mm = solve(camera.without_distortion(), nearest_mm, 4 * frontal_mm)
+        if not camera.is_bent:
             return depth_mm
         # the lens polynomial is valid only in and near the image; the search therefore stays near ``depth_mm``, which
         # holds without distortion

@@ -104,8 +104,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
         H = matmul(camera.local_K(ray), M_patch2camera)
         H /= H[2, 2]
         x, y = camera.distort(ray[None])[0]
-        is_bent = any(camera.distortion)
-        ellipse = _ellipse_of_moments(_project_rim(camera, M_patch2camera)) if is_bent else project_disc(H)
+        ellipse = _ellipse_of_moments(_project_rim(camera, M_patch2camera)) if camera.is_bent else project_disc(H)
         axes = (ellipse.major, ellipse.minor, ellipse.angle_deg)
         keypoints[n] = (x, y, k.patch_id, *axes, H, 1.0, np.nan)
     return keypoints

@@ -10,8 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.camera.paper import spread_ink
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise_edges
 from kpbench.geometry.homography import project_disc_sizes, project_discs
+from kpbench.geometry.outline import flatten
+from kpbench.geometry.warp import PointMap, join_polygons, subdivide
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.render.placement import Placement
 from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
@@ -65,11 +68,30 @@ class Rendering:
     masks: tuple[Mask, ...]
 
 
+def inked_polygons(patch: Patch, tolerance: float, ink_gain: float) -> tuple[list[Float], list[Float]]:
+    """Return the polygons of the black ink of a patch, and of the whole patch with all its ink, after ink gain.
+
+    Parameters
+    ----------
+    patch : Patch
+    tolerance : float
+        Largest distance between an arc and its chords, in disc radii.
+    ink_gain : float
+        See :func:`rasterise_patches`.
+    """
+    black = flatten(spread_ink(patch.black_region, ink_gain), tolerance)
+    inner = flatten(spread_ink(patch.black_region, ink_gain, patch.extent), tolerance)
+    # the winding numbers of the disc and of the ink add up to 2 where they overlap; the reversed overlap leaves 1
+    disc = [*flatten(patch.disc_region, tolerance), *black, *(polygon[::-1] for polygon in inner)]
+    return black, disc if ink_gain > 0 else disc[:1]
+
+
 @lru_cache(maxsize=256)
-def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64], int, int]:
+def _unit_edges(patch: Patch, tolerance: float, ink_gain: float = 0.0) -> tuple[Float, NDArray[np.int64], int, int]:
     """Return the polygons of a patch on the unit disc, as edges.
 
     ``tolerance`` : largest distance between an edge and the true outline, in disc radii.
+    ``ink_gain`` : see :func:`rasterise_patches`.
 
     Returns
     -------
@@ -80,15 +102,18 @@ def _unit_edges(patch: Patch, tolerance: float) -> tuple[Float, NDArray[np.int64
     black_count, disc_count : int
         Number of vertices of the black areas and of the disc.
     """
-    black, disc = unit_polygons(patch, tolerance)
-    sizes = [len(polygon) for polygon in (*black, *disc)]
-    next_vertex = np.concatenate([np.roll(np.arange(n), -1) + sum(sizes[:k]) for k, n in enumerate(sizes)])
-    points = np.concatenate([*black, *disc])
+    black, disc = inked_polygons(patch, tolerance, ink_gain) if ink_gain else unit_polygons(patch, tolerance)
+    points, next_vertex = join_polygons([*black, *disc])
     black_count = sum(map(len, black))
     return np.ascontiguousarray(points.T), next_vertex, black_count, len(points) - black_count
 
 
-def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-3) -> list[Mask]:
+def rasterise_patches(
+    placements: Sequence[Placement],
+    tolerance_px: float = 1e-3,
+    warp: PointMap | None = None,
+    ink_gain: float = 0.0,
+) -> list[Mask]:
     """Compute which fraction of each pixel each patch covers. The patches may belong to different images.
 
     Parameters
@@ -96,6 +121,12 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
     placements : sequence of Placement
     tolerance_px : float
         Largest distance between a drawn edge and the true edge, px.
+    warp : callable, optional
+        Map from px to px that follows the homographies, such as the distortion of a lens. Straight edges are divided
+        so that their chords follow their bent images.
+    ink_gain : float
+        Distance by which all edges of the black ink move outwards, in disc radii. Black ink beyond the rim of a patch
+        counts as part of the patch. See :func:`kpbench.camera.paper.spread_ink`.
 
     Returns
     -------
@@ -110,10 +141,14 @@ def rasterise_patches(placements: Sequence[Placement], tolerance_px: float = 1e-
     tolerances = np.ldexp(0.5, np.frexp(tolerance_px / major)[1])
     starts, ends, counts, boxes = list[Float](), list[Float](), list[int](), list[Box]()
     for p, tolerance in zip(placements, tolerances, strict=True):
-        (u, v), next_vertex, black_count, disc_count = _unit_edges(p.patch, float(tolerance))
+        (u, v), next_vertex, black_count, disc_count = _unit_edges(p.patch, float(tolerance), ink_gain)
         H = p.H_patch2image
         mapped = H[:, :1] * u + H[:, 1:2] * v + H[:, 2:]
         points = mapped[:2] / mapped[2]
+        if warp is not None:
+            finer, next_vertex, edge = subdivide(points.T, next_vertex, warp, tolerance_px)
+            black_count = int(np.searchsorted(edge, black_count))
+            disc_count, points = len(edge) - black_count, warp(finer).T
         starts.append(points)
         ends.append(points.take(next_vertex, axis=1))
         counts += [black_count, disc_count]

@@ -181,6 +181,9 @@ def _estimate_pose(points_mm: Float, xy: Float, camera: Camera) -> tuple[Float, 
     """
     import cv2
 
+    if camera.model == "fisheye":  # OpenCV's solver knows the model of Brown only
+        straight = camera.without_distortion()
+        xy, camera = straight.distort(camera.undistort(xy)), straight
     points, pixels = np.ascontiguousarray(points_mm), np.ascontiguousarray(xy)
     distortion = np.array(camera.distortion)
     _, rvec, tvec = cv2.solvePnP(points, pixels, camera.K, distortion, flags=cv2.SOLVEPNP_IPPE)
