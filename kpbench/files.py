@@ -26,11 +26,11 @@ LARGEST_TEXT = 2**22
 
 PACKAGE = Path(__file__).parent
 """Folder of this package."""
-_IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": "configs"}
+_IN_CHECKOUT = {"patches": "patches", "suites": "benchmarks/suites", "configs": "configs", "cameras": "cameras"}
 
 
 def shipped_folder(name: str) -> Path:
-    """Return the folder of data that ships with kpbench: ``patches``, ``suites`` or ``configs``.
+    """Return the folder of data that ships with kpbench: ``patches``, ``suites``, ``configs`` or ``cameras``.
 
     A checkout holds the data in the folders where people edit them. An installed package holds all data in one folder.
     """

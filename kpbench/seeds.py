@@ -7,6 +7,8 @@ import numpy as np
 # The pixels of every dataset depend on these numbers. A new stage gets a new number. No number may change its meaning.
 SYNTH_BACKGROUND, SYNTH_SCENE, SYNTH_DETERIORATION, SYNTH_LOOKALIKES, SYNTH_AUGMENTATION = range(5)
 """Stages in the making of an image of a synthetic set."""
+SYNTH_CAMERA = 5
+"""The same: what a camera draws for an image, and the noise of its sensor."""
 SUITE_BACKGROUND, SUITE_SCENE, SUITE_EFFECT, SUITE_FIELD = range(16, 20)
 """Stages in the making of a base scene of a suite. SUITE_SCENE draws pose, inks and light. SUITE_FIELD draws the random
 fields of the effects noise and low light."""

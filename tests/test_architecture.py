@@ -56,7 +56,7 @@ ROOMS = {
     "render": ["geometry", "patches", "camera"],
     "degrade": ["geometry"],
     "dataset": ["geometry"],
-    "synth": ["geometry", "patches", "render", "degrade", "dataset"],
+    "synth": ["geometry", "camera", "patches", "render", "degrade", "dataset"],
     "analysis": ["geometry", "patches", "printing", "render"],
     "predictions": [],
     "scoring": ["geometry"],

@@ -1,7 +1,12 @@
+from .chain import photograph as photograph
+from .chain import scene_light as scene_light
 from .optics import blur_linear as blur_linear
 from .optics import chromatic_scales as chromatic_scales
 from .optics import psf_kernel as psf_kernel
 from .optics import vignetting as vignetting
+from .preset import CameraPreset as CameraPreset
+from .preset import load_camera_preset as load_camera_preset
+from .preset import shipped_cameras as shipped_cameras
 from .processing import demosaic as demosaic
 from .processing import develop as develop
 from .processing import guided_denoise as guided_denoise

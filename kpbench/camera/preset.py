@@ -11,6 +11,7 @@ import numpy as np
 from kpbench.camera.tone import ToneCurve, random_tone_curve
 from kpbench.errors import DataError
 from kpbench.files import shipped_folder
+from kpbench.portable import cos_sin
 from kpbench.toml import TomlTable, name_source, read_toml
 
 CAMERA_SCHEMA = "kpbench.camera/1"
@@ -23,6 +24,12 @@ QUANTITIES: dict[str, dict[str, tuple[float, float, float]]] = {
         "pixel_um": (0.3, 100.0, 3.0),
         "defocus_px": (0.0, 35.0, 0.0),
         "corner_loss": (0.0, 1.0, 0.0),
+        "k1": (-0.5, 0.5, 0.0),
+    },
+    "scene": {
+        "motion_px": (0.0, 100.0, 0.0),
+        "row_time": (0.0, 1.0, 0.0),
+        "ink_gain": (-0.1, 0.1, 0.0),
     },
     "sensor": {
         "full_well_e": (10.0, 1e6, 10_000.0),
@@ -44,6 +51,8 @@ QUANTITIES: dict[str, dict[str, tuple[float, float, float]]] = {
 }
 """Least value, greatest value and default of each quantity of each table of a camera's file."""
 WHOLE = ("bits", "jpeg_quality")
+GAIN_STEP = 2.0**-10
+"""Drawn ink gains are multiples of this, in disc radii, so that images share cached outlines."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +109,10 @@ class CameraPreset:
         for name, (low, high) in self.spans:
             value = low + (high - low) * float(rng.random())
             drawn[name] = round(value) if name in WHOLE else round(value, 4)
+        c, s = (float(v) for v in cos_sin(2 * np.pi * float(rng.random())))
+        length = drawn.pop("motion_px")
+        drawn["velocity_px"] = [round(length * c, 4), round(length * s, 4)]
+        drawn["ink_gain"] = round(drawn["ink_gain"] / GAIN_STEP) * GAIN_STEP
         error = drawn.pop("balance_error")
         drawn["balance"] = [round(1 + error * float(rng.uniform(-1, 1)), 4) for _ in ("red", "blue")]
         curve = self._draw_tone(rng, drawn.pop("tone_parameter"))

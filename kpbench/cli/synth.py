@@ -32,9 +32,14 @@ if TYPE_CHECKING:
 @click.option(
     "--deteriorate",
     type=click.Choice(["none", "paper", "ladder"]),
-    default="paper",
-    show_default=True,
-    help="Effects on images. paper: as in the paper. ladder: one or two effects of kpbench degrade, mild to severe.",
+    default=None,
+    help="Effects on images. paper: as in the paper, the default without --camera. none: the default with --camera. "
+    "ladder: one or two effects of kpbench degrade, mild to severe.",
+)
+@click.option(
+    "--camera",
+    help="Camera that takes the images: industrial, webcam, phone, action-cam, or a .toml file of your own. Light is "
+    "blurred before the tone curve, as in a real camera.",
 )
 @click.option(
     "--radius-px",
@@ -67,7 +72,8 @@ def synth(
     patches: tuple[Path, ...],
     size: tuple[int, int],
     channels: int,
-    deteriorate: str,
+    deteriorate: str | None,
+    camera: str | None,
     radius_px: tuple[float, float],
     distractors: int,
     augment: Path | None,
@@ -81,9 +87,11 @@ def synth(
       kpbench synth --n 2000 --backgrounds photos/ --out val --seed 1
       kpbench synth --n 500 --patches mine.toml --patches other.toml --out own-designs
       kpbench synth --n 500 --radius-px 3:20 --deteriorate ladder --out small-and-worn
+      kpbench synth --n 500 --camera webcam --channels 3 --out webcam
       kpbench synth --n 500 --deteriorate none --augment pipeline.json --out augmented
       kpbench synth --n 100000 --engine dask --scheduler tcp://host:8786 --out /shared/big
     """
+    from kpbench.camera.preset import load_camera_preset
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.render.placement import Limits
     from kpbench.synth.synthetic import SynthConfig
@@ -94,7 +102,8 @@ def synth(
         seed=seed,
         size_px=size,
         channels=channels,
-        deteriorate=deteriorate,
+        deteriorate=deteriorate or ("paper" if camera is None else "none"),
+        camera=None if camera is None else load_camera_preset(camera),
         limits=Limits.of_radius(*radius_px),
         shard_size=shard_size,
         backgrounds=backgrounds,

@@ -17,7 +17,7 @@ from kpbench.geometry.outline import flatten
 from kpbench.geometry.warp import PointMap, join_polygons, subdivide
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.render.placement import Placement
-from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
+from kpbench.types import KEYPOINT_DTYPE, Float, Float32, UInt8
 
 WHOLLY_COVERED = 1 - 1e-6
 """A pixel lies wholly on a patch if its computed coverage is above this threshold. Because of rounding, the computed
@@ -213,15 +213,16 @@ def keypoint_table(placements: Sequence[Placement], visible: Sequence[float]) ->
     return keypoints
 
 
-def paint_patch(image: UInt8, mask: Mask, black: float, white: float) -> float:
+def paint_patch(image: UInt8 | Float32, mask: Mask, black: float, white: float) -> float:
     """Draw one patch into an image, in place.
 
     Parameters
     ----------
-    image : ndarray of shape (H, W) or (H, W, 3), uint8
+    image : ndarray of shape (H, W) or (H, W, 3), uint8 or float32
+        Grey levels, or linear light.
     mask : Mask
     black, white : float
-        Grey levels of the two inks.
+        Grey levels or light of the two inks.
 
     Returns
     -------
@@ -238,7 +239,7 @@ def paint_patch(image: UInt8, mask: Mask, black: float, white: float) -> float:
     change = (white - part.astype(np.float64)) * disc
     change -= ink
     change += part
-    image[in_image] = np.rint(change, out=change)
+    image[in_image] = np.rint(change, out=change) if image.dtype == np.uint8 else change
     return 1.0 if disc.size == mask.disc.size else float(disc.sum() / mask.disc.sum())
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.camera.preset import CameraPreset
 from kpbench.dataset.shard import Sample
 from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_ladder_mix, draw_paper_mix
@@ -24,11 +25,13 @@ from kpbench.render.scene import render_scene
 from kpbench.seeds import (
     SYNTH_AUGMENTATION,
     SYNTH_BACKGROUND,
+    SYNTH_CAMERA,
     SYNTH_DETERIORATION,
     SYNTH_LOOKALIKES,
     SYNTH_SCENE,
     stream,
 )
+from kpbench.synth.camera_view import photograph_scene
 from kpbench.synth.finish import augment_scene, degrade_scene, discs_of
 from kpbench.synth.user_pipeline import try_pipeline
 
@@ -63,6 +66,10 @@ class SynthConfig:
     distractors : int
         Largest number of look-alikes per image, see :func:`kpbench.render.draw_lookalikes`. The patches of a scene
         do not depend on ``distractors``.
+    camera : CameraPreset or None
+        A camera from :func:`kpbench.camera.load_camera_preset` that takes the scenes in linear light. None for
+        a linear world: inks keep their levels. The patches of a scene do not depend on ``camera``, but move with the
+        lens. ``deteriorate`` is applied to the finished image.
     augmentation : str or None
         An albumentations pipeline from :func:`kpbench.synth.load_augmentation`, applied last.
     limits : Limits
@@ -92,6 +99,7 @@ class SynthConfig:
     shard_size: int = 500
     backgrounds: Path | None = None
     distractors: int = 0
+    camera: CameraPreset | None = None
     augmentation: str | None = None
     limits: Limits = field(default_factory=Limits)
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)
@@ -121,6 +129,10 @@ class SynthConfig:
                 largest_radius <= most,
                 f"`limits.radius_px` goes up to {largest_radius:g}, expected at most {most} at this size",
             ),
+            (
+                self.camera is None or self.augmentation is None,
+                "`camera` and `augmentation` are both given, expected one of them",
+            ),
             (self.shard_size >= 1, f"`shard_size` is {self.shard_size}, expected a number of images from 1"),
         ):
             if not is_valid:
@@ -149,6 +161,7 @@ class SynthConfig:
             "shard_size": self.shard_size,
             "backgrounds": describe_backgrounds(self.photos),
             "distractors": self.distractors,
+            **({} if self.camera is None else {"camera": self.camera.to_dict()}),
             "augmentation": self.augmentation and json.loads(self.augmentation),
             "limits": {key: list(v) if isinstance(v, tuple) else v for key, v in asdict(self.limits).items()},
             "patches": [patch.to_dict() for patch in self.patches],
@@ -184,10 +197,17 @@ class SynthConfig:
             rng = stream(self.seed, index, SYNTH_LOOKALIKES)
             draw_lookalikes(background.image, rng, int(rng.integers(self.distractors + 1)), self.patches)
         placements = random_placements(stream(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits)
-        scene = render_scene(background.image, placements)
+        taken = list[Effect]()
+        if self.camera is None:
+            scene = render_scene(background.image, placements)
+        else:
+            rng = stream(self.seed, index, SYNTH_CAMERA)
+            taken = [self.camera.draw(rng)]
+            scene = photograph_scene(background.image, placements, rng, taken[0])
         rng = stream(self.seed, index, SYNTH_DETERIORATION)
         effects = self._draw_effects(rng, scene.keypoints)
         scene = degrade_scene(scene, rng, effects)
+        effects = [*taken, *effects]
         if self.augmentation is not None:
             seed = int(stream(self.seed, index, SYNTH_AUGMENTATION).integers(2**31))
             scene = augment_scene(scene, placements, effects, self.augmentation, seed)
