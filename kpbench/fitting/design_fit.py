@@ -34,6 +34,7 @@ lies outside the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective. Each entry of ``_State.bend`` has the standard deviation ``EXPECTED_BEND_PER_PX`` times the
 short semi-axis in px."""
+TONE_STD = 0.5
 LEAST_PIXELS = 12
 """A step needs at least this many pixels inside the patch, and at least this many pixels on edges."""
 
@@ -147,6 +148,7 @@ class _State:
     ncc: float = 0.0
     noise: float = np.inf
     moved: float = np.inf
+    tone: tuple[float, float] = (0.0, 0.0)
 
 
 def _scale_state(state: _State, octaves: int) -> _State:
@@ -214,8 +216,10 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     grey, m = image[y0:y1, x0:x1][inside], ink[inside]
     if len(m) < LEAST_PIXELS:
         return state
-    mean_ink, mean_grey = float(m.mean()), float(grey.mean())
-    centred_ink, centred_grey = m - np.float32(mean_ink), grey - np.float32(mean_grey)
+    even, odd = m * (1 - m), m * (1 - m) * (1 - 2 * m)
+    toned = m + np.float32(state.tone[0]) * even + np.float32(state.tone[1]) * odd
+    mean_ink, mean_grey = float(toned.mean()), float(grey.mean())
+    centred_ink, centred_grey = toned - np.float32(mean_ink), grey - np.float32(mean_grey)
     slope = float(centred_ink @ centred_grey) / max(float(centred_ink @ centred_ink), 1e-6)
     residual = centred_grey - np.float32(slope) * centred_ink
     unexplained, spread = float(residual @ residual) / len(m), float(centred_grey @ centred_grey) / len(m)
@@ -231,16 +235,19 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     if len(edge) < LEAST_PIXELS:
         return state
     at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
-    gx, gy, dx, dy, m, residual = gx[edge], gy[edge], dx[at_x], dy[at_y, 0], m[edge], residual[edge]
+    steep = 1 + np.float32(state.tone[0]) * (1 - 2 * m) + np.float32(state.tone[1]) * (1 - 6 * m + 6 * m * m)
+    gx, gy, laplace = gx * steep, gy * steep, laplace * steep
+    gx, gy, dx, dy, m, residual = gx[edge], gy[edge], dx[at_x], dy[at_y, 0], toned[edge], residual[edge]
+    even, odd = even[edge], odd[edge]
     a, b, c, d = _inverse(state.A)
     u, v, outward = a * dx + b * dy, c * dx + d * dy, gx * dx + gy * dy
-    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace[edge] / 2)
+    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace[edge] / 2, even, odd)
     moves = np.stack([np.ones_like(m), m, *(slope * g for g in shifts)])
     # pixels that the model cannot explain, such as shadow edges, rain and occluders, get a smaller weight
     size, half = np.abs(residual), len(residual) // 2
     usual = 2.5 * 1.48 * float(np.partition(size, half)[half]) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(size, 1e-6))
-    return _solve_step(state, weighted @ moves.T, weighted @ residual, minor, extent)
+    return _solve_step(state, weighted @ moves.T, weighted @ residual, minor, extent, slope)
 
 
 def _inverse(m: Float) -> tuple[float, float, float, float]:
@@ -250,7 +257,7 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
     return d / det, -b / det, -c / det, a / det
 
 
-def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float) -> _State:
+def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float, slope: float) -> _State:
     """Solve the normal equations and take the step, within limits.
 
     The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, and the square of the
@@ -263,6 +270,10 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2
     normal[[8, 9], [8, 9]] += prior
     target[8:10] -= prior * state.bend
+    tone_prior = (state.noise**2 + 1) / TONE_STD**2 * slope**2 / max(slope**2, 1) 
+    tone_prior = (state.noise**2 + 1) / TONE_STD**2
+    normal[[11, 12], [11, 12]] += tone_prior
+    target[11:13] -= tone_prior * np.array(state.tone)
     delta = np.linalg.solve(normal, target)
     shift, grow = delta[2:4], delta[4:8].reshape(2, 2)
     shift = shift * min(1.0, 0.3 * minor / max(float(np.hypot(*shift)), 1e-9))
@@ -271,5 +282,6 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
     # a stronger bend would put part of the model behind the camera
     bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend)), 1e-9)))
+    tone = np.clip(np.array(state.tone) + delta[11:13], [-1.5, -1.0], [1.5, 1.0])
     moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
-    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved)
+    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved, tone=(float(tone[0]), float(tone[1])))
