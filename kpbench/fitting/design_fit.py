@@ -2,7 +2,7 @@
 
 :func:`fit` renders the design with exact coverage, blurs the rendering, and changes the unknowns until rendering and
 pixels agree (Gauss-Newton with robust weights). The unknowns are the centre, the affine map, the perspective, both
-inks and the blur. :mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to start from.
+inks, the blur and the tone curve. :mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to start from.
 """
 
 from __future__ import annotations
@@ -34,7 +34,12 @@ lies outside the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective. Each entry of ``_State.bend`` has the standard deviation ``EXPECTED_BEND_PER_PX`` times the
 short semi-axis in px."""
-TONE_STD = 0.5
+EXPECTED_TONE = 0.5
+"""Prior of the tone curve: the standard deviation of both coefficients of ``_State.tone``."""
+LARGEST_TONE = np.array([1.5, 1.0])
+"""Largest size of the two coefficients. With larger ones, the curve falls."""
+MARGIN_BLURS = 1.6
+"""Width of the rim that is left out, in standard deviations of the blur: the ground shines into the blurred rim."""
 LEAST_PIXELS = 12
 """A step needs at least this many pixels inside the patch, and at least this many pixels on edges."""
 
@@ -135,7 +140,8 @@ class _State:
 
     ``window`` is the map that the fit started from. A pixel counts if this map, centred at ``xy``, places the pixel in
     the patch, further from the patch's edge than a margin. ``bend`` holds the first two entries of the last row of the
-    homography. ``moved`` is the size of the last step, in short semi-axes.
+    homography. ``moved`` is the size of the last step, in short semi-axes. ``tone`` holds the coefficients (a, b) of the
+    tone curve, see :func:`_tone_curve`.
     """
 
     xy: Float
@@ -210,14 +216,13 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     ink = ink[y0 - y : y1 - y, x0 - x : x1 - x]
     dx, dy = np.arange(x0, x1) - state.xy[0], np.arange(y0, y1)[:, None] - state.xy[1]
     minor = max(float(short_semi_axis(state.window[None])[0]), 1e-6)
-    reach = max(extent - (0.35 + 0.8 * state.blur) / minor, 0.5)
+    reach = max(extent - (0.35 + MARGIN_BLURS * state.blur) / minor, 0.5)
     a, b, c, d = _inverse(state.window)
     inside = (a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < reach**2
     grey, m = image[y0:y1, x0:x1][inside], ink[inside]
     if len(m) < LEAST_PIXELS:
         return state
-    even, odd = m * (1 - m), m * (1 - m) * (1 - 2 * m)
-    toned = m + np.float32(state.tone[0]) * even + np.float32(state.tone[1]) * odd
+    toned, steep, even, odd = _tone_curve(m, *state.tone)
     mean_ink, mean_grey = float(toned.mean()), float(grey.mean())
     centred_ink, centred_grey = toned - np.float32(mean_ink), grey - np.float32(mean_grey)
     slope = float(centred_ink @ centred_grey) / max(float(centred_ink @ centred_ink), 1e-6)
@@ -235,19 +240,37 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     if len(edge) < LEAST_PIXELS:
         return state
     at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
-    steep = 1 + np.float32(state.tone[0]) * (1 - 2 * m) + np.float32(state.tone[1]) * (1 - 6 * m + 6 * m * m)
-    gx, gy, laplace = gx * steep, gy * steep, laplace * steep
-    gx, gy, dx, dy, m, residual = gx[edge], gy[edge], dx[at_x], dy[at_y, 0], toned[edge], residual[edge]
-    even, odd = even[edge], odd[edge]
+    gx, gy, laplace = (steep[edge] * part[edge] for part in (gx, gy, laplace))
+    dx, dy, m, residual, even, odd = dx[at_x], dy[at_y, 0], toned[edge], residual[edge], even[edge], odd[edge]
     a, b, c, d = _inverse(state.A)
     u, v, outward = a * dx + b * dy, c * dx + d * dy, gx * dx + gy * dy
-    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace[edge] / 2, even, odd)
+    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace / 2, even, odd)
     moves = np.stack([np.ones_like(m), m, *(slope * g for g in shifts)])
     # pixels that the model cannot explain, such as shadow edges, rain and occluders, get a smaller weight
     size, half = np.abs(residual), len(residual) // 2
     usual = 2.5 * 1.48 * float(np.partition(size, half)[half]) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(size, 1e-6))
-    return _solve_step(state, weighted @ moves.T, weighted @ residual, minor, extent, slope)
+    return _solve_step(state, weighted @ moves.T, weighted @ residual, minor, extent)
+
+
+def _tone_curve(ink: Float32, a: float, b: float) -> tuple[Float32, Float32, Float32, Float32]:
+    """Return how black pixels look behind a tone curve, and the slope of the curve.
+
+    Light is blurred before a camera's tone curve. So a pixel that black ink covers by half is darker or brighter than
+    the mean of the inks. Between the inks, the curve is ``ink + a ink (1 - ink) + b ink (1 - ink) (1 - 2 ink)``: any
+    smooth curve that keeps both inks, to third order. Ink that spreads has nearly the same effect as ``a``.
+
+    Returns
+    -------
+    toned, slope, even, odd : ndarray of the shape of ``ink``
+        The curve, its slope, and its derivatives with respect to ``a`` and ``b``.
+    """
+    even = ink * (1 - ink)
+    bent = 1 - 2 * ink
+    odd = even * bent
+    toned = ink + np.float32(a) * even + np.float32(b) * odd
+    slope = 1 + np.float32(a) * bent + np.float32(b) * (1 - 6 * even)
+    return toned, slope, even, odd
 
 
 def _inverse(m: Float) -> tuple[float, float, float, float]:
@@ -257,11 +280,11 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
     return d / det, -b / det, -c / det, a / det
 
 
-def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float, slope: float) -> _State:
+def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float) -> _State:
     """Solve the normal equations and take the step, within limits.
 
-    The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, and the square of the
-    blur.
+    The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, the square of the blur,
+    and the two coefficients of the tone curve.
     """
     # the pixels of a design of sectors alone do not determine its size and some stretches, so damping holds them
     damped = np.arange(4, 11)
@@ -270,10 +293,9 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2
     normal[[8, 9], [8, 9]] += prior
     target[8:10] -= prior * state.bend
-    tone_prior = (state.noise**2 + 1) / TONE_STD**2 * slope**2 / max(slope**2, 1) 
-    tone_prior = (state.noise**2 + 1) / TONE_STD**2
-    normal[[11, 12], [11, 12]] += tone_prior
-    target[11:13] -= tone_prior * np.array(state.tone)
+    prior = (state.noise**2 + 1) / EXPECTED_TONE**2
+    normal[[11, 12], [11, 12]] += prior
+    target[11:13] -= prior * np.array(state.tone)
     delta = np.linalg.solve(normal, target)
     shift, grow = delta[2:4], delta[4:8].reshape(2, 2)
     shift = shift * min(1.0, 0.3 * minor / max(float(np.hypot(*shift)), 1e-9))
@@ -282,6 +304,14 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
     # a stronger bend would put part of the model behind the camera
     bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend)), 1e-9)))
-    tone = np.clip(np.array(state.tone) + delta[11:13], [-1.5, -1.0], [1.5, 1.0])
+    tone = np.clip(np.array(state.tone) + delta[11:13], -LARGEST_TONE, LARGEST_TONE)
     moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
-    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved, tone=(float(tone[0]), float(tone[1])))
+    return replace(
+        state,
+        xy=state.xy + shift,
+        A=state.A + grow,
+        bend=bend,
+        blur=blur,
+        moved=moved,
+        tone=(float(tone[0]), float(tone[1])),
+    )
