@@ -2,7 +2,8 @@
 
 :func:`fit` renders the design with exact coverage, blurs the rendering, and changes the unknowns until rendering and
 pixels agree (Gauss-Newton with robust weights). The unknowns are the centre, the affine map, the perspective, both
-inks, the blur and the tone curve. :mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to start from.
+inks, the blur and the tone curve. :mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to
+start from.
 """
 
 from __future__ import annotations
@@ -140,8 +141,8 @@ class _State:
 
     ``window`` is the map that the fit started from. A pixel counts if this map, centred at ``xy``, places the pixel in
     the patch, further from the patch's edge than a margin. ``bend`` holds the first two entries of the last row of the
-    homography. ``moved`` is the size of the last step, in short semi-axes. ``tone`` holds the coefficients (a, b) of the
-    tone curve, see :func:`_tone_curve`.
+    homography. ``moved`` is the size of the last step, in short semi-axes. ``tone`` holds the coefficients (a, b) of
+    the tone curve, see :func:`_tone_curve`.
     """
 
     xy: Float
@@ -306,12 +307,5 @@ def _solve_step(state: _State, normal: Float, target: Float, minor: float, exten
     bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend)), 1e-9)))
     tone = np.clip(np.array(state.tone) + delta[11:13], -LARGEST_TONE, LARGEST_TONE)
     moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
-    return replace(
-        state,
-        xy=state.xy + shift,
-        A=state.A + grow,
-        bend=bend,
-        blur=blur,
-        moved=moved,
-        tone=(float(tone[0]), float(tone[1])),
-    )
+    a, b = tone.tolist()
+    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved, tone=(a, b))
