@@ -23,7 +23,7 @@ from kpbench.types import Float, Float32
 COARSE_PX, COARSE_STEPS = 30.0, 2
 """The first ``COARSE_STEPS`` steps use the finest pyramid level in which the patch's long semi-axis, with rim and quiet
 zone, is at most ``COARSE_PX`` px."""
-FINE_PX, FINE_STEPS = 100.0, 3
+FINE_PX, FINE_STEPS = 100.0, 4
 """The last ``FINE_STEPS`` steps use the finest pyramid level in which this semi-axis is at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
 """If a step changes centre and map by at most this, in short semi-axes, no further step is taken in the same level."""
@@ -35,7 +35,7 @@ lies outside the patch."""
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective. Each entry of ``_State.bend`` has the standard deviation ``EXPECTED_BEND_PER_PX`` times the
 short semi-axis in px."""
-EXPECTED_TONE = 0.5
+EXPECTED_TONE = 0.25
 """Prior of the tone curve: the standard deviation of both coefficients of ``_State.tone``."""
 LARGEST_TONE = np.array([1.5, 1.0])
 """Largest size of the two coefficients. With larger ones, the curve falls."""
