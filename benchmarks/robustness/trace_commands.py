@@ -25,6 +25,7 @@ render-patches --pdf --svg --png --dxf --dpi 100 --out print
 render-patches --board hexagon --page a3 --out board
 render-patches --measured 99.8,100.1 --out print
 synth --n 6 --size 320x240 --shard-size 3 --out set
+synth --n 2 --size 320x240 --channels 3 --camera phone --out taken
 synth --n 6 --size 320x240 --shard-size 3 --shard-range 0:1 --out parts
 synth --n 6 --size 320x240 --shard-size 3 --shard-range 1:2 --out parts
 synth --n 2 --size 320x240 --channels 3 --deteriorate ladder --distractors 2 --augment pipeline.json --out ladder

@@ -30,6 +30,8 @@ def can_trace():
 needs_strace = pytest.mark.skipif(not can_trace(), reason="strace is missing, or may not trace here")
 CHAIN = """
 synth --n 8 --size 128x128 --workers 1 --out set
+synth --n 2 --size 128x128 --augment pipeline.json --workers 1 --out augmented
+synth --n 2 --size 128x128 --camera webcam --workers 1 --out taken
 synth --n 2 --size 128x128 --shard-range 0:1 --workers 1 --out parts
 merge parts
 suite paper-v1 --images 1 --size 64x64 --only blur --workers 1 --out suite
@@ -57,6 +59,8 @@ def test_commands_connect_to_nothing_and_write_where_they_were_told_to(tmp_path,
         "print('to the end')\n"
     )
     (tmp_path / "work").mkdir()
+    pipeline = '{"transform": {"__class_fullname__": "Rotate", "limit": [-20, 20], "p": 1.0}}'
+    (tmp_path / "work" / "pipeline.json").write_text(pipeline)
     done, lines = tracing.trace([sys.executable, "-P", "-c", code, CHAIN], tmp_path / "work", tmp_path)
     assert "to the end" in done.stdout, done.stdout + done.stderr
     assert (tmp_path / "work" / "report.html").exists()
