@@ -39,7 +39,7 @@ def start(out: Path, *more: str) -> subprocess.Popen[str]:
     # a shell's background jobs ignore Ctrl-C, and those of nohup SIGHUP; the command must not inherit that
     code = (
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "signal.signal(signal.SIGHUP, signal.SIG_DFL); import kpbench.cli; kpbench.cli.main()"
+        "signal.signal(signal.SIGHUP, signal.SIG_DFL); import kpbench.cli; kpbench.cli.run()"
     )
     words = [sys.executable, "-c", code, *WORDS, "--out", str(out), *more]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True)
