@@ -38,6 +38,27 @@ def shipped_folder(name: str) -> Path:
     return installed if installed.is_dir() else PACKAGE.parent / _IN_CHECKOUT[name]
 
 
+def find_shipped(kind: str, name: str, word: str) -> Path:
+    """Return the TOML file of a shipped name, or the path of a TOML file of the user's.
+
+    ``kind`` : ``suites`` or ``cameras``. ``word`` : what the file describes, for the message.
+
+    Raises
+    ------
+    DataError
+        If the name is not among the shipped names and does not end in .toml.
+    """
+    shipped = shipped_files(kind)
+    if name not in shipped and Path(name).suffix != ".toml":
+        raise DataError(f"there is no {word} {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+    return shipped.get(name, Path(name))
+
+
+def shipped_files(kind: str) -> dict[str, Path]:
+    """Return the TOML files of one kind that ship with kpbench, keyed by their names."""
+    return {path.stem: path for path in sorted(shipped_folder(kind).glob("*.toml"))}
+
+
 def image_files(folder: Path, exclude: Path | None = None) -> tuple[str, ...]:
     """Return the paths of all images below a folder, relative to the folder.
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from kpbench.camera.tone import ToneCurve, random_tone_curve
 from kpbench.errors import DataError
-from kpbench.files import shipped_folder
+from kpbench.files import find_shipped, shipped_files
 from kpbench.portable import cos_sin
 from kpbench.toml import TomlTable, name_source, read_toml
 
@@ -146,7 +146,7 @@ def shipped_cameras() -> dict[str, Path]:
     >>> list(shipped_cameras())
     ['action-cam', 'industrial', 'phone', 'webcam']
     """
-    return {path.stem: path for path in sorted(shipped_folder("cameras").glob("*.toml"))}
+    return shipped_files("cameras")
 
 
 def load_camera_preset(name: str) -> CameraPreset:
@@ -169,10 +169,7 @@ def load_camera_preset(name: str) -> CameraPreset:
     >>> load_camera_preset("phone").tones
     ('s-curve', 'random')
     """
-    shipped = shipped_cameras()
-    path = shipped.get(name, Path(name))
-    if name not in shipped and path.suffix != ".toml":
-        raise DataError(f"there is no camera {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+    path = find_shipped("cameras", name, "camera")
     content = read_toml(path, DataError)
     with name_source(path, DataError):
         return _parse_preset(TomlTable(content, ("schema", "name", "seed", *QUANTITIES), DataError))

@@ -10,12 +10,12 @@ import numpy as np
 from kpbench.camera.chain import SCENE_TONE, photograph, scene_light
 from kpbench.camera.shutter import PatchMotion, Shutter
 from kpbench.degrade.effects import jpeg
-from kpbench.geometry.lens import Lens
+from kpbench.geometry.camera import Camera
 from kpbench.geometry.warp import PointMap
 from kpbench.render.exposure import expose_patches, true_placement
 from kpbench.render.placement import Placement
 from kpbench.render.scene import Rendering, keypoint_table, measure_contrast, paint_patch
-from kpbench.types import Float, UInt8
+from kpbench.types import UInt8
 
 
 def lens_warp(k1: float, width_px: int, height_px: int) -> PointMap | None:
@@ -25,13 +25,8 @@ def lens_warp(k1: float, width_px: int, height_px: int) -> PointMap | None:
     """
     if not k1:
         return None
-    lens, focal_px = Lens("brown", (k1, 0.0, 0.0, 0.0)), float(width_px)
-    centre = np.array([(width_px - 1) / 2, (height_px - 1) / 2])
-
-    def warp(points: Float) -> Float:
-        return np.asarray(lens.distort((points - centre) / focal_px) * focal_px + centre)
-
-    return warp
+    camera = Camera(width_px, height_px, float(width_px), (k1, 0.0, 0.0, 0.0))
+    return lambda points: camera.distort((points - camera.K[:2, 2]) / camera.focal_px)
 
 
 def photograph_scene(

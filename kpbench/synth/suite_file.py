@@ -7,7 +7,7 @@ from pathlib import Path
 
 from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
-from kpbench.files import shipped_folder
+from kpbench.files import find_shipped, shipped_files
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board_file import find_patch
 from kpbench.patches.design import Patch, shipped_patches
@@ -131,7 +131,7 @@ def shipped_suites() -> dict[str, Path]:
     >>> list(shipped_suites())
     ['extended-v1', 'paper-v1']
     """
-    return {path.stem: path for path in sorted(shipped_folder("suites").glob("*.toml"))}
+    return shipped_files("suites")
 
 
 def load_suite(name: str) -> Suite:
@@ -154,10 +154,7 @@ def load_suite(name: str) -> Suite:
     >>> [condition.name for condition in load_suite("paper-v1").conditions]
     ['scale', 'pitch', 'blur', 'dimming', 'noise']
     """
-    shipped = shipped_suites()
-    path = shipped.get(name, Path(name))
-    if name not in shipped and path.suffix != ".toml":
-        raise DataError(f"there is no suite {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+    path = find_shipped("suites", name, "suite")
     content = read_toml(path, DataError)
     with name_source(path, DataError):
         return _parse_suite(TomlTable(content, SUITE_KEYS, DataError))
