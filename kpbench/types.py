@@ -52,6 +52,13 @@ class Detections:
         Confidence. A higher score means a surer detection.
     patch_id : ndarray of shape (n,), int64, or None
         Identity of each point; None if the detector does not identify patches.
+    A_patch2image : ndarray of shape (n, 2, 2), float64, or None
+        Affine frame of each patch: the map from the unit disc of the patch to the image, px, without the shift to
+        ``xy``. It holds the ellipse and the rotation.
+    covariance : ndarray of shape (n, 2, 2), float64, or None
+        Covariance of the error of ``xy``, px².
+    blur_px : ndarray of shape (n,), float64, or None
+        Standard deviation of the image blur at each patch, px.
 
     Raises
     ------
@@ -71,6 +78,9 @@ class Detections:
     xy: Float
     score: Float
     patch_id: NDArray[np.int64] | None = None
+    A_patch2image: Float | None = None
+    covariance: Float | None = None
+    blur_px: Float | None = None
 
     def __post_init__(self) -> None:
         assign = object.__setattr__
@@ -88,14 +98,20 @@ class Detections:
             assign(self, "patch_id", ids.astype(np.int64).reshape(-1))
             if ids.size != len(self.xy):
                 raise ValueError(f"{len(self.xy)} points have {ids.size} patch IDs, expected one per point")
+        for name, shape in (("A_patch2image", (2, 2)), ("covariance", (2, 2)), ("blur_px", ())):
+            if getattr(self, name) is not None:
+                column = np.asarray(getattr(self, name), np.float64)
+                if column.shape != (len(self.xy), *shape):
+                    raise ValueError(f"{name} has shape {column.shape}, expected {(len(self.xy), *shape)}")
+                assign(self, name, column)
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def __getitem__(self, keep: Any) -> Detections:
         """Return the detections that a mask, a slice or an index array selects."""
-        ids = None if self.patch_id is None else self.patch_id[keep]
-        return Detections(self.xy[keep], self.score[keep], ids)
+        optional = (self.patch_id, self.A_patch2image, self.covariance, self.blur_px)
+        return Detections(self.xy[keep], self.score[keep], *(None if c is None else c[keep] for c in optional))
 
     @classmethod
     def none(cls, with_ids: bool = True) -> Detections:
