@@ -80,6 +80,8 @@ class LoadedDetector:
         identity is unchanged. None if the detector has no version, or was loaded with ``patches``.
     run_many : callable, optional
         Function of a sequence of images, for a detector that takes less time per image if it gets several images.
+    patches : tuple of Patch
+        Designs that the detector looks for; empty if the detector has no attribute ``patches``.
 
     Raises
     ------
@@ -103,6 +105,7 @@ class LoadedDetector:
     board: str | None = None
     identity: str | None = None
     run_many: Callable[[Sequence[UInt8]], list[Detections]] | None = None
+    patches: tuple[Patch, ...] = ()
 
     def __call__(self, image: UInt8) -> Detections:
         """Return the detections in one image, uint8, (H, W) grey or (H, W, 3) RGB."""
@@ -167,7 +170,7 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     if name.endswith(".onnx"):
         made = _set_threshold(_import_attribute(DETECTORS["superpoint"])(Path(name)), threshold)
         digest = _digest_detector(name, made.version, made)
-        return LoadedDetector(Path(name).stem, made.version, made.detect, identity=digest)
+        return LoadedDetector(Path(name).stem, made.version, made.detect, identity=digest, patches=made.patches)
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
@@ -190,7 +193,11 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     version = getattr(made, "version", __version__ if name in DETECTORS else None)
     label = name if name in DETECTORS else str(getattr(made, "name", name))
     identity = None if version is None or patches is not None else _digest_detector(name, str(version), made)
-    return LoadedDetector(label, str(version or "unknown"), run, getattr(made, "board", None), identity)
+    designs = getattr(made, "patches", ())
+    designs = designs if isinstance(designs, tuple) and all(isinstance(p, Patch) for p in designs) else ()
+    return LoadedDetector(
+        label, str(version or "unknown"), run, getattr(made, "board", None), identity, patches=designs
+    )
 
 
 def _digest_detector(name: str, version: str, detector: Any) -> str:

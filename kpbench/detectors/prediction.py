@@ -13,6 +13,7 @@ import numpy as np
 from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detector
+from kpbench.detectors.inverted import InvertedPrints
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import UNDECODABLE, ImageSource, image_writer
@@ -156,7 +157,7 @@ def predict_images(
     """
     warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
-    found, labels = list[ImageResult](), list[str]()
+    found, labels, inverted = list[ImageResult](), list[str](), InvertedPrints(loaded)
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
     with image_writer(overlay, source.length, source.fps, source.names) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
@@ -164,6 +165,7 @@ def predict_images(
                 result = (Detections.none(), source.problems.get(label, UNDECODABLE))
             else:
                 result = _detect(loaded, image, threshold)
+                inverted.look(label, image, result[0])
             found.append(result)
             labels.append(label)
             draw(label, None if image is None else draw_detections(image, result[0]))

@@ -13,7 +13,9 @@ from helpers import kpbench
 from PIL import Image
 
 from kpbench.detectors.interface import load_detector
-from kpbench.images import decode_photo, open_images
+from kpbench.detectors.prediction import predict_images
+from kpbench.images import ImageSource, decode_photo, open_images
+from kpbench.patches import shipped_patches
 from kpbench.pixels import bits_used, decode_pixels
 from kpbench.predictions.coco import CocoDataset
 
@@ -211,3 +213,23 @@ def test_an_inverted_print_of_the_four_designs_is_another_valid_print(here):
             names.setdefault(k["patch_id"], []).append(int(found.patch_id[nearest]))
             assert found.score[nearest] > 0.9
     assert names == {0: [0, 0], 1: [1, 1], 2: [2, 3], 3: [3, 2]}
+
+
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [(["checker", "trefoil", "wheel"], "wheel"), (["mushroom"], "mushroom"), (["wheel", "mushroom"], "")],
+)
+def test_an_inverted_print_is_told_where_its_inverse_is_no_design(here, names, told):
+    designs = tuple(patch for patch in shipped_patches() if patch.name in names)
+    detector = load_detector("template", patches=designs)
+    said = {}
+    for options in ((), ("--invert",)):
+        page, _ = printed(here, *(word for name in names for word in ("--patch", name)), *options)
+        small = cv2.resize(page, None, fx=0.3, fy=0.3, interpolation=cv2.INTER_AREA)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            predict_images(ImageSource(iter([("page.png", small), ("again.png", small)]), 2), detector)
+        said[bool(options)] = [str(warning.message) for warning in caught]
+    told_of = f"page.png: the print is inverted: {told} shows black and white swapped"
+    assert said[False] == []
+    assert [line.partition(";")[0] for line in said[True]] == ([told_of] if told else [])
