@@ -172,7 +172,7 @@ def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Samp
 def _deflate(image: UInt8) -> Any:
     """Compress an image in the zlib format, or store it uncompressed if a strip of it hardly shrinks, as noise does."""
     middle = len(image) // 2
-    strip = image[middle - len(image) // 40 : middle + len(image) // 40 + 1]
+    strip = image[middle - len(image) // 100 : middle + len(image) // 100 + 1]
     is_noise = len(deflate.zlib_compress(strip, DEFLATE_LEVEL)) > LEAST_SHRINKING * strip.size
     return deflate.zlib_compress(image, 0 if is_noise else DEFLATE_LEVEL)
 

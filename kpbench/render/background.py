@@ -175,7 +175,7 @@ class PhotoFolder:
             photo = self.decode(name, channels)
             if photo is not None:
                 image = _crop_and_resize(photo, width_px, height_px, zoom, x_fraction, y_fraction)
-                return Background(np.ascontiguousarray(image[:, ::-1]) if mirror else image, name, tuple(broken))
+                return Background(np.asarray(cv2.flip(image, 1), np.uint8) if mirror else image, name, tuple(broken))
             broken.append(name)
         raise DataError(f"{self.path}: its image files can no longer be decoded")
 

@@ -280,7 +280,8 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
     for n, mask in enumerate(masks):
         in_image, in_box = clip_to_image(mask.box, image)
         part = image[in_image]
-        grey = (part if part.ndim == 2 else part.mean(axis=2)).astype(np.float64).ravel()
+        channels = [part] if part.ndim == 2 else [part[..., n] for n in range(3)]  # faster than a mean over an axis
+        grey = (sum(channel.astype(np.float64) for channel in channels) / len(channels)).ravel()
         black = mask.black[in_box].ravel()
         weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # faster than indexing with a mask
         count = weight.sum()
