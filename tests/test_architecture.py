@@ -63,7 +63,7 @@ ROOMS = {
     "report": ["scoring"],
     "fitting": ["geometry", "patches"],
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
-    "training": ["geometry", "patches", "render", "degrade", "scoring", "fitting", "detectors", "dataset"],
+    "training": ["geometry", "camera", "patches", "render", "degrade", "scoring", "fitting", "detectors", "dataset"],
     "evaluate": ["dataset", "predictions", "scoring", "report", "synth"],
     "benchmark": ["patches", "dataset", "synth", "predictions", "scoring", "report", "detectors"],
 }

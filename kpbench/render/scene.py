@@ -249,7 +249,7 @@ def fraction_inside(image: UInt8, mask: Mask) -> float:
     return float(mask.disc[in_box].sum() / mask.disc.sum())
 
 
-def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
+def measure_contrast(image: UInt8 | Float32, masks: Sequence[Mask]) -> Float:
     """Measure the contrast of each patch in an image: grey level of white minus grey level of black.
 
     The method is linear regression over the pixels that lie wholly on the patch: the grey level of a pixel is regressed
@@ -258,7 +258,8 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
 
     Parameters
     ----------
-    image : ndarray of shape (H, W) or (H, W, 3), uint8
+    image : ndarray of shape (H, W) or (H, W, 3), uint8 or float32
+        Grey levels.
     masks : sequence of Mask
 
     Returns
@@ -281,7 +282,7 @@ def measure_contrast(image: UInt8, masks: Sequence[Mask]) -> Float:
         in_image, in_box = clip_to_image(mask.box, image)
         part = image[in_image]
         channels = [part] if part.ndim == 2 else [part[..., n] for n in range(3)]  # faster than a mean over an axis
-        grey = (sum(channel.astype(np.float64) for channel in channels) / len(channels)).ravel()
+        grey = (np.add.reduce([channel.astype(np.float64) for channel in channels]) / len(channels)).ravel()
         black = mask.black[in_box].ravel()
         weight = (mask.disc[in_box].ravel() > WHOLLY_COVERED).astype(np.float64)  # faster than indexing with a mask
         count = weight.sum()

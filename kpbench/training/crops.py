@@ -7,6 +7,7 @@ learns neither to report nor to suppress this keypoint.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -15,9 +16,10 @@ import numpy as np
 from kpbench.geometry.homography import project_disc_sizes
 from kpbench.images import resize
 from kpbench.patches.design import Patch
+from kpbench.render.detail import paint_detail
 from kpbench.render.lookalikes import draw_lookalikes
 from kpbench.render.placement import Limits, Placement, random_poses
-from kpbench.render.scene import paint_patch, rasterise_patches
+from kpbench.render.scene import Mask, measure_contrast, paint_patch, rasterise_patches
 from kpbench.training.crop_effects import degrade_crop
 from kpbench.types import Float, Float32, UInt8
 
@@ -36,6 +38,10 @@ default radii of :class:`kpbench.render.Limits`."""
 LEAST_SIGNAL = 12.0
 """Least value of contrast · √area / noise; keypoints with a lower value are ignored. The signal-to-noise
 ratio of a matched filter is then 6, because the inks differ from their mean by half the contrast."""
+SOILED_SHARE, LEAST_SOILED_PX = 0.25, 5.0
+"""Probability that patches of a crop carry detail, and the shortest semi-axis of such a patch, px."""
+QUIET_SHARE, QUIET_ZONES = 0.25, (0.1, 0.3)
+"""Probability that the patches of a crop have a quiet zone, and its widths, disc radii."""
 LEAST_KEYPOINT_CONTRAST = 4.0
 """Least contrast, grey levels; keypoints with a lower contrast are ignored. At lower contrasts, rounding to 8 bits
 destroys most of the pattern."""
@@ -81,23 +87,26 @@ def make_crops(
         drawn = _place_patches(rng, patches, image, Limits.of_radius(*ENLARGED_RADIUS_PX) if scale > 1 else Limits())
         discs.append(drawn)
         canvases.append(image)
-    _paint_all(canvases, discs)
+    masks = _paint_all(canvases, discs)
     for n in range(count):
-        hidden = _occlude(canvases[n], rng, discs[n], patches) if rng.random() < 0.08 * severity else ()
+        _soil(canvases[n], rng, discs[n])
+        hidden = _occlude(canvases[n], rng, discs[n], patches) if rng.random() < 0.12 * severity else ()
         radius = min((d.minor for d in discs[n]), default=20.0)
-        image, gain, kernel, sigma = degrade_crop(canvases[n], rng, severity, radius)
-        images[n] = resize(image, width, height)
-        scale = np.divide(images[n].shape, image.shape)[::-1]
-        at = [((d.x + 0.5) * scale[0] - 0.5, (d.y + 0.5) * scale[1] - 0.5) for d in discs[n]]
-        inside = [(x, y, d) for (x, y), d in zip(at, discs[n], strict=True) if _contains(images[n], x, y)]
-        for k, (x, y, disc) in enumerate(inside[:MOST_KEYPOINTS]):
-            left = 1.0 - (kernel / (2 * disc.minor)) ** 2
-            contrast = gain * (disc.placement.white - disc.placement.black) * max(left, 0.0)
-            area = np.pi * disc.major * disc.minor
-            buried = contrast < max(LEAST_KEYPOINT_CONTRAST, LEAST_SIGNAL * sigma / np.sqrt(area))
-            small = disc.minor * scale.min() < 0.5 * Limits().minor_axis_px
-            lost = buried or small or any(disc is h for h in hidden)
-            keypoints[n, k] = x, y, disc.design, disc.major * scale.max() if lost else 0.0
+        degraded = degrade_crop(canvases[n], rng, severity, radius)
+        contrasts = measure_contrast(degraded.clean, masks[n])
+        images[n] = resize(degraded.image, width, height)
+        scale = np.divide(images[n].shape, degraded.image.shape)[::-1]
+        k = 0
+        for disc, contrast in zip(discs[n], contrasts.tolist(), strict=True):
+            x, y = (disc.x + 0.5) * scale[0] - 0.5, (disc.y + 0.5) * scale[1] - 0.5
+            if k == MOST_KEYPOINTS or not _contains(images[n], x, y):
+                continue
+            least = LEAST_SIGNAL * degraded.sigma / np.sqrt(np.pi * disc.major * disc.minor)
+            is_seen = contrast >= max(LEAST_KEYPOINT_CONTRAST, least)  # False for nan
+            is_small = disc.minor * scale.min() < 0.5 * Limits().minor_axis_px
+            is_lost = not is_seen or is_small or any(disc is h for h in hidden)
+            keypoints[n, k] = x, y, disc.design, disc.major * scale.max() if is_lost else 0.0
+            k += 1
     return images, keypoints
 
 
@@ -182,8 +191,10 @@ def _place_patches(rng: np.random.Generator, patches: Sequence[Patch], image: UI
         if one_design:
             design[:] = design[0]
     discs: list[Disc] = []
+    quiet_zone = float(rng.choice(QUIET_ZONES)) if rng.random() < QUIET_SHARE else 0.0
     for n, H in enumerate(poses):
         patch = patches[design[n]]
+        patch = replace(patch, quiet_zone=max(patch.quiet_zone, quiet_zone))
         (x, y), reach = centres[n], patch.extent * majors[n]
         seen = -reach < x < width + reach and -reach < y < height + reach and majors[n] < 4 * width
         apart = all(np.hypot(x - d.x, y - d.y) > reach + d.placement.patch.extent * d.major for d in discs)
@@ -224,10 +235,21 @@ def _occlude(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc], patc
     return hidden
 
 
-def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> None:
-    """Draw the patches of a whole batch with one call of the rasteriser."""
+def _soil(image: UInt8, rng: np.random.Generator, discs: Sequence[Disc]) -> None:
+    """Paint detail onto some of the patches of a crop: hubs, screws, ropes, tape, creases, dirt and glare."""
+    if rng.random() < SOILED_SHARE:
+        for disc in discs:
+            if disc.minor >= LEAST_SOILED_PX and rng.random() < 0.6:
+                H = disc.placement.H_patch2image
+                paint_detail(image, H, rng, int(rng.integers(1, 4)), white=rng.uniform(0.5, 1.0))
+
+
+def _paint_all(canvases: Sequence[UInt8], discs: Sequence[Sequence[Disc]]) -> list[list[Mask]]:
+    """Draw the patches of a whole batch with one call of the rasteriser. Return the masks of each crop."""
     drawn = [(image, disc.placement) for image, row in zip(canvases, discs, strict=True) for disc in row]
     # an edge error of 1/64 px is far below the noise; the exact edges of benchmark images would take longer
     masks = rasterise_patches([placement for _, placement in drawn], 1 / 64)
     for (image, placement), mask in zip(drawn, masks, strict=True):
         paint_patch(image, mask, placement.black, placement.white)
+    rest = iter(masks)
+    return [[next(rest) for _ in row] for row in discs]
