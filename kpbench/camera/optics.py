@@ -186,6 +186,13 @@ def blur_linear(light: Float32, kernel: Float) -> Float32:
 
 
 @lru_cache(maxsize=4)
+def _square_distances(shape: tuple[int, int], centre_px: tuple[float, float]) -> Float32:
+    """Return the square of each pixel's distance from the centre, px², ndarray of shape (H, W), float32."""
+    height, width = shape
+    dx, dy = np.arange(width) - centre_px[0], np.arange(height) - centre_px[1]
+    return np.asarray(dx * dx + (dy * dy)[:, None], np.float32)
+
+
 def _vignetting_map(
     shape: tuple[int, int],
     focal_length_px: float | None,
@@ -193,18 +200,18 @@ def _vignetting_map(
     centre_px: tuple[float, float],
 ) -> Float32:
     """Return the fraction of the light that reaches each pixel, ndarray of shape (H, W), float32."""
-    height, width = shape
-    dx, dy = np.arange(width) - centre_px[0], np.arange(height) - centre_px[1]
-    square = dx * dx + (dy * dy)[:, None]
-    rest = np.zeros(shape)
-    half_diagonal_square = (width * width + height * height) / 4
-    for coefficient in reversed(polynomial):
-        rest = (rest + coefficient) * (square / half_diagonal_square)
-    gain = np.maximum(1 + rest, 0)
+    square = _square_distances(shape, centre_px)
+    gain = np.full_like(square, polynomial[-1] if polynomial else 0.0)
+    scale = np.float32(4 / (shape[0] ** 2 + shape[1] ** 2))  # half of the diagonal is the unit
+    for coefficient in (*reversed(polynomial[:-1]), 1.0):
+        gain *= square
+        gain *= scale
+        gain += np.float32(coefficient)
+    np.maximum(gain, 0, out=gain)
     if focal_length_px is not None:
-        slant = 1 + square / (focal_length_px * focal_length_px)
-        gain = gain / (slant * slant)
-    return np.asarray(gain.astype(np.float32))
+        slant = 1 + square * np.float32(1 / focal_length_px**2)
+        gain /= slant * slant
+    return np.asarray(gain, np.float32)
 
 
 def vignetting(

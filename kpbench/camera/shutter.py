@@ -83,8 +83,8 @@ class Shutter:
     ) -> Float:
         """Return where points appear in the image.
 
-        The row of each point solves ``y = Y(point, time(y) + instant)``. The method is the secant method, starting
-        from two steps of the fixed-point iteration.
+        The row of each point solves ``y = Y(point, time(y) + instant)``. The method is the secant method. Its first step
+        takes the slope from the image at the time of row 0 and the image one step of the fixed-point iteration later.
 
         Parameters
         ----------
@@ -109,9 +109,8 @@ class Shutter:
         image = moving_map(points, instant + self.start)
         if self.row_time == 0:
             return image
-        y0 = image[:, 1]
-        image = moving_map(points, instant + self.start + self.row_time * y0)
-        y, error0 = image[:, 1], image[:, 1] - y0
+        y0, error0 = np.zeros(len(points)), image[:, 1]
+        y = image[:, 1]
         for _ in range(ROW_STEPS):
             image = moving_map(points, instant + self.start + self.row_time * y)
             error = image[:, 1] - y

@@ -68,7 +68,8 @@ class Rendering:
     masks: tuple[Mask, ...]
 
 
-def inked_polygons(patch: Patch, tolerance: float, ink_gain: float) -> tuple[list[Float], list[Float]]:
+@lru_cache(maxsize=1024)
+def inked_polygons(patch: Patch, tolerance: float, ink_gain: float) -> tuple[tuple[Float, ...], tuple[Float, ...]]:
     """Return the polygons of the black ink of a patch, and of the whole patch with all its ink, after ink gain.
 
     Parameters
@@ -83,7 +84,7 @@ def inked_polygons(patch: Patch, tolerance: float, ink_gain: float) -> tuple[lis
     inner = flatten(spread_ink(patch.black_region, ink_gain, patch.extent), tolerance)
     # the winding numbers of the disc and of the ink add up to 2 where they overlap; the reversed overlap leaves 1
     disc = [*flatten(patch.disc_region, tolerance), *black, *(polygon[::-1] for polygon in inner)]
-    return black, disc if ink_gain > 0 else disc[:1]
+    return tuple(black), tuple(disc if ink_gain > 0 else disc[:1])
 
 
 @lru_cache(maxsize=256)
