@@ -57,7 +57,7 @@ ROOMS = {
     "degrade": ["geometry"],
     "dataset": ["geometry"],
     "synth": ["geometry", "camera", "patches", "render", "degrade", "dataset"],
-    "analysis": ["geometry", "patches", "printing", "render"],
+    "analysis": ["geometry", "camera", "patches", "printing", "render"],
     "predictions": [],
     "scoring": ["geometry"],
     "report": ["scoring"],

@@ -1,5 +1,7 @@
 from .analyse import AnalysisRun as AnalysisRun
 from .analyse import analyse_patches as analyse_patches
+from .bias import BIAS_EFFECTS as BIAS_EFFECTS
+from .bias import camera_bias as camera_bias
 from .cell_images import PolarGrid as PolarGrid
 from .cell_images import attitudes as attitudes
 from .family import FAMILY_GRID as FAMILY_GRID

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from kpbench.analysis.figure import FIGURE_SUFFIXES, draw_designs
@@ -50,6 +51,7 @@ def analyse_patches(
     patches: Sequence[Patch] | None = None,
     *,
     search_family: bool = False,
+    most_bias_px: float | None = None,
     backgrounds: str | Path | None = None,
     json_file: str | Path | None = None,
     figure_file: str | Path | None = None,
@@ -64,6 +66,8 @@ def analyse_patches(
     search_family : bool
         Whether to repeat the search that chose the shipped designs, and to measure the best set. ``patches`` must then
         be left out.
+    most_bias_px : float, optional
+        See :func:`kpbench.analysis.search_designs`; only with ``search_family``.
     backgrounds : str or Path, optional
         Folder of photographs in which the places that look like a design are counted. If left out, places in procedural
         backgrounds are counted.
@@ -94,6 +98,8 @@ def analyse_patches(
     """
     if search_family and patches is not None:
         raise DesignError("`search_family=True` goes through a whole family of designs and takes no `patches`")
+    if most_bias_px is not None and not search_family:
+        raise DesignError("`most_bias_px` limits a search, expected `search_family=True` beside it")
     suffix = Path(figure_file or "a.svg").suffix.lower()
     if suffix not in FIGURE_SUFFIXES:
         raise DesignError(f"{figure_file}: expected a file that ends in {', '.join(FIGURE_SUFFIXES)}")
@@ -101,7 +107,8 @@ def analyse_patches(
         if file is not None:
             require_writable(Path(file), kind)
     windows = background_windows(backgrounds)
-    found = search_designs(windows, shipped_patches(), progress=progress) if search_family else None
+    search = partial(search_designs, windows, shipped_patches(), most_bias_px=most_bias_px, progress=progress)
+    found = search() if search_family else None
     measured = found.sets[0] if found else tuple(patches or shipped_patches())
     analysis = measure_designs(measured, windows, progress)
     if json_file is not None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from kpbench.analysis.bias import camera_bias
 from kpbench.analysis.cell_images import BLUR, TILTS_DEG, WINDOW_PX, PolarGrid
 from kpbench.analysis.identity import (
     IDENTITY_STEPS,
@@ -46,6 +47,10 @@ class DesignMeasures:
     tilt_bias_px : float
         Distance between the keypoint and the centre of the disc's ellipse at a tilt of 60 degrees. 0 if straight edges
         determine the keypoint.
+    camera_bias_px, camera_bias_toned_px : dict of str to float
+        Distance by which an effect of a camera moves the centre, by name of the effect, see
+        :func:`kpbench.analysis.camera_bias`: for a fit that takes the camera for linear, and for a fit with an unknown
+        tone curve.
     black_fraction : float
         Black share of the design's area.
     pixels_needed : float
@@ -76,6 +81,8 @@ class DesignMeasures:
     turned_distance: float
     mirrored_distance: float
     tilt_bias_px: float
+    camera_bias_px: dict[str, float]
+    camera_bias_toned_px: dict[str, float]
     black_fraction: float
     pixels_needed: float
     bounds: tuple[Bound, ...]
@@ -194,6 +201,8 @@ def measure_designs(
             centre_is_crossing=patch.centre_is_crossing,
             symmetry_order=symmetry_order(patch),
             tilt_bias_px=tilt_bias(patch),
+            camera_bias_px=camera_bias(patch),
+            camera_bias_toned_px=camera_bias(patch, knows_tone=True),
             bounds=tuple(bounds[n]),
             natural_response=tuple(natural[n]),
             natural_response_blurred=tuple(natural_blurred[n]),

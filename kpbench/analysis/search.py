@@ -6,7 +6,8 @@ A design is kept if
 * a circle of 2 px diameter fits into every region of one ink at a disc radius of 4 px,
 * its basin is at least 0.10 (a single corner has a basin of 0.041),
 * its Cramér-Rao bound without the rim's pixels is at most 0.05 px at a disc radius of 5 px,
-* at most one in 500 windows of natural images looks like the design (a correlation above 0.8).
+* at most one in 500 windows of natural images looks like the design (a correlation above 0.8),
+* if a limit is given: a camera moves its centre by at most this, see :func:`kpbench.analysis.camera_bias`.
 
 Of all sets of four designs, the best set is the set whose closest two designs are farthest apart. If several sets tie,
 the next closest pairs of the sets decide.
@@ -21,11 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.analysis.bias import camera_bias
 from kpbench.analysis.family import FAMILY_GRID, code_of, enumerate_family, inks_of
 from kpbench.analysis.identity import IDENTITY_STEPS, correlation_and_distance
 from kpbench.analysis.localisation import basin, design_bound
 from kpbench.analysis.measures import SIZES_PX, pixels_needed
 from kpbench.analysis.natural_images import natural_response
+from kpbench.errors import DesignError
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, UInt8
 
@@ -34,7 +37,7 @@ LEAST_BASIN = 0.10  # ink contrasts
 MOST_BOUND_PX = 0.05  # at 5 px radius, without the rim
 MOST_NATURAL = 1 / 500  # share of windows with a correlation above 0.8
 SET_SIZE = 4
-SEARCH_STEPS = 6 + IDENTITY_STEPS
+SEARCH_STEPS = 7 + IDENTITY_STEPS
 """Number of steps that :func:`search_designs` reports."""
 
 
@@ -146,6 +149,7 @@ def search_designs(
     windows: UInt8,
     known: tuple[Patch, ...] = (),
     count: int = 2,
+    most_bias_px: float | None = None,
     progress: Callable[[int], None] = lambda steps: None,
 ) -> SearchResult:
     """Return the best sets of four designs of the family; the module's docstring states the rule.
@@ -158,8 +162,15 @@ def search_designs(
         Designs that keep their names and IDs in the result. The name of any other design is its code.
     count : int
         Largest number of sets that are returned.
+    most_bias_px : float, optional
+        Largest bias of a fit that takes the camera for linear, under any effect but the bow. None: any bias.
     progress : callable
         Called with the number of steps finished since the last call. The numbers add up to :data:`SEARCH_STEPS`.
+
+    Raises
+    ------
+    DesignError
+        If fewer than four designs are left.
 
     Examples
     --------
@@ -176,6 +187,11 @@ def search_designs(
     innermost = inks[:, :8]
     edges = innermost != np.roll(innermost, 1, axis=1)
     measures: list[Float] = []
+    named = {code_of(p): p for p in known}
+
+    def design(code: np.uint32, nth: int) -> Patch:
+        """Return the known design of this code, or else a design with the ID ``len(named) + nth``."""
+        return named.get(int(code)) or family.patch(int(code), f"{code:08x}", len(named) + nth)
 
     def keep(name: str, chosen: NDArray[np.bool_]) -> None:
         nonlocal codes, inks, measures
@@ -193,16 +209,20 @@ def search_designs(
     keep("bound centre", measures[1] >= LEAST_BASIN)
     keep("bound without rim", design_bound(FAMILY_GRID, inks, SIZES_PX[0], rim=False)[0] <= MOST_BOUND_PX)
     keep("rare in images", natural_response(FAMILY_GRID, inks, windows)[:, 0] <= MOST_NATURAL)
+    if most_bias_px is not None:
+        keep("bias of a camera", np.array([_bias(design(code, 0)) for code in codes]) <= most_bias_px)
+    else:
+        progress(1)
+    if len(codes) < SET_SIZE:
+        raise DesignError(f"`most_bias_px` of {most_bias_px} leaves {len(codes)} designs, expected at least {SET_SIZE}")
     distance = correlation_and_distance(FAMILY_GRID, inks, progress)[1]
     sets = best_sets(distance, SET_SIZE, count)
-    named = {code_of(p): p for p in known}
-    patches = tuple(
-        tuple(
-            named.get(int(code)) or family.patch(int(code), f"{code:08x}", len(named) + n)
-            for n, code in enumerate(codes[list(members)])
-        )
-        for members in sets
-    )
+    patches = tuple(tuple(design(code, n) for n, code in enumerate(codes[list(members)])) for members in sets)
     patches = tuple(tuple(sorted(members, key=lambda p: p.patch_id)) for members in patches)
     distances = tuple(pair_distances(distance, members) for members in sets)
     return SearchResult(counts, median_bound, median_basin, median_pixels, patches, distances)
+
+
+def _bias(patch: Patch) -> float:
+    """Return the largest bias under the effects whose bias does not depend on the paper's shape, px."""
+    return max(px for effect, px in camera_bias(patch).items() if effect != "bow")

@@ -83,8 +83,8 @@ class Shutter:
     ) -> Float:
         """Return where points appear in the image.
 
-        The row of each point solves ``y = Y(point, time(y) + instant)``. The method is the secant method. Its first step
-        takes the slope from the image at the time of row 0 and the image one step of the fixed-point iteration later.
+        The row of each point solves ``y = Y(point, time(y) + instant)``. The method is the secant method, starting from
+        row 0 and one step of the fixed-point iteration.
 
         Parameters
         ----------

@@ -27,6 +27,12 @@ def figure_suffixes() -> Iterable[str]:
 @click.command("analyze-patches")
 @click.argument("files", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--search", "search_family", is_flag=True, help="Repeat the search that chose the shipped designs.")
+@click.option(
+    "--most-bias-px",
+    type=click.FloatRange(min=0.0),
+    metavar="PX",
+    help="With --search: keep designs whose centre a camera moves by at most PX, at 20 px radius.",
+)
 @click.option("--json", "json_file", type=click.Path(path_type=Path), help="Write all measures as JSON.")
 @click.option(
     "--figure",
@@ -38,6 +44,7 @@ def figure_suffixes() -> Iterable[str]:
 def analyze_patches(
     files: tuple[Path, ...],
     search_family: bool,
+    most_bias_px: float | None,
     json_file: Path | None,
     figure_file: Path | None,
     backgrounds: Path | None,
@@ -51,6 +58,7 @@ def analyze_patches(
       kpbench analyze-patches
       kpbench analyze-patches my-patch.toml my-other-patch.toml --figure mine.svg
       kpbench analyze-patches --search --json search.json
+      kpbench analyze-patches --search --most-bias-px 0.02
     """
     from kpbench.analysis.analyse import analyse_patches, count_steps
     from kpbench.cli.progress import progress_bar
@@ -59,11 +67,14 @@ def analyze_patches(
 
     if search_family and files:
         raise click.UsageError("--search goes through a whole family of designs and takes no FILES")
+    if most_bias_px is not None and not search_family:
+        raise click.UsageError("--most-bias-px only with --search")
     patches = load_patches(files) if files else None
     with progress_bar(count_steps(search_family), "analysis", unit="step") as progress:
         found = analyse_patches(
             patches,
             search_family=search_family,
+            most_bias_px=most_bias_px,
             backgrounds=backgrounds,
             json_file=json_file,
             figure_file=figure_file,
@@ -76,6 +87,7 @@ def analyze_patches(
 
 def _tables(analysis: Analysis) -> list[Table]:
     """Return tables with a row per design: bounds, other measures, and for several designs their distances."""
+    from kpbench.analysis.bias import BIAS_EFFECTS
     from kpbench.report.tables import Table
 
     names = [f"{design.patch_id} {design.name}" for design in analysis.designs]
@@ -106,6 +118,15 @@ def _tables(analysis: Analysis) -> list[Table]:
     title = "Centre, orientation, smallest size, and look-alikes (share of places in images, correlation > 0.8)"
     columns = ("crossing", "tilt bias px", "basin", "turns alike", "mirror", "needs px", "in images", "blurred")
     tables.append(Table(title, ("", *columns, "nearest", "distance"), tuple(measures)))
+    title = (
+        "Bias of the centre in px at 20 px radius, blur 1 px, noise-free: a fit that takes the camera for linear; in "
+    )
+    title += "brackets a fit with an unknown tone curve"
+    rows = tuple(
+        (label, *(f"{d.camera_bias_px[name]:.3f} ({d.camera_bias_toned_px[name]:.3f})" for name in BIAS_EFFECTS))
+        for label, d in zip(names, analysis.designs, strict=True)
+    )
+    tables.append(Table(title, ("", *BIAS_EFFECTS), rows))
     if len(names) > 1:
         title = "Distance between designs, over rotation, tilt, mirror, gain and offset, blurred (ink contrasts)"
         distances = zip(names, analysis.distance.tolist(), strict=True)
