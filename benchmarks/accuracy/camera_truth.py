@@ -1,9 +1,10 @@
 """Is the truth true behind a camera? An independent fit of the centre under each step of the camera chain. Simulated.
 
 For every step, one patch is photographed by the chain with this step alone. The centre is then found again by least
-squares. The model counts ink at 10 x 10 points a pixel and maps these points back by formulas of its own or of OpenCV:
-no outline, coverage, kernel or lens of kpbench (but two tone curves are inverted by kpbench). Unknown are centre,
-affine deformation, the two inks and the background. The fit starts up to 0.5 px and 3 % off.
+squares. The model counts ink at 16 x 16 points a pixel (8 x 8 for the mean of many draws) and maps these points back by
+formulas of its own or of OpenCV: no outline, coverage, kernel or lens of kpbench (but two tone curves are inverted by
+kpbench). Unknown are centre, affine deformation, the two inks and the background. The fit starts up to 0.5 px and 3 %
+off.
 
 Geometric and optical steps have neither noise nor rounding but that of the file: the RMS error is printed. Sensor and
 processing steps are drawn ``--draws`` times: the length of the mean error is printed, and its standard error.
@@ -28,7 +29,7 @@ from kpbench.render import Limits, random_placements
 from kpbench.synth.camera_view import photograph_scene
 from kpbench.types import Float
 
-SUB, WIDTH, HEIGHT, MARGIN = 10, 240, 180, 7
+WIDTH, HEIGHT, MARGIN = 240, 180, 7
 
 
 def neutral() -> dict[str, Any]:
@@ -51,7 +52,7 @@ class Step:
     """One step: its record, and how the fit sees it."""
 
     def __init__(self, record: dict[str, Any], noisy: bool = False) -> None:
-        self.record, self.noisy = neutral() | record, noisy
+        self.record, self.noisy, self.sub = neutral() | record, noisy, 8 if noisy else 16
 
     def back(self, points: Float) -> list[Float]:
         """Map points of the image to the points that they show, at each instant of the exposure."""
@@ -76,7 +77,7 @@ class Step:
 
     def spread(self, fine: Float) -> Float:
         """Spread light as the optics do, on the fine grid."""
-        radius = self.record["defocus_px"] * SUB
+        radius = self.record["defocus_px"] * self.sub
         if not radius:
             return fine
         reach = int(radius) + 1
@@ -120,9 +121,9 @@ def is_black(patch: Patch, points: Float, gain: float) -> Float:
 
 
 def shares(patch: Patch, H: Float, box: tuple[int, int, int, int], step: Step) -> Float:
-    """Shares of (black, white, background) on the fine grid, shape (3, height * SUB, width * SUB)."""
-    x, y, w, h = box
-    px, py = x - 0.5 + (np.arange(w * SUB) + 0.5) / SUB, y - 0.5 + (np.arange(h * SUB) + 0.5) / SUB
+    """Shares of (black, white, background) on the fine grid, shape (3, height * sub, width * sub)."""
+    (x, y, w, h), sub = box, step.sub
+    px, py = x - 0.5 + (np.arange(w * sub) + 0.5) / sub, y - 0.5 + (np.arange(h * sub) + 0.5) / sub
     grid = np.stack(np.meshgrid(px, py), axis=-1).reshape(-1, 2)
     fine, inverse = np.zeros((3, len(grid))), np.linalg.inv(H)
     views = step.back(grid)
@@ -132,11 +133,11 @@ def shares(patch: Patch, H: Float, box: tuple[int, int, int, int], step: Step) -
         black = is_black(patch, on_patch, step.record["ink_gain"])
         inside = (np.hypot(*on_patch.T) < patch.extent) | black
         fine += np.stack([black, inside & ~black, ~inside]) / len(views)
-    return step.spread(fine.reshape(3, h * SUB, w * SUB)) * step.fade(grid).reshape(h * SUB, w * SUB)
+    return step.spread(fine.reshape(3, h * sub, w * sub)) * step.fade(grid).reshape(h * sub, w * sub)
 
 
-def binned(fine: Float) -> Float:
-    return fine.reshape(*fine.shape[:-2], fine.shape[-2] // SUB, SUB, fine.shape[-1] // SUB, SUB).mean(axis=(-3, -1))
+def binned(fine: Float, sub: int) -> Float:
+    return fine.reshape(*fine.shape[:-2], fine.shape[-2] // sub, sub, fine.shape[-1] // sub, sub).mean(axis=(-3, -1))
 
 
 def estimate(seen: Float, patch: Patch, H: Float, box: tuple[int, int, int, int], step: Step, rng: Any) -> Float:
@@ -149,10 +150,11 @@ def estimate(seen: Float, patch: Patch, H: Float, box: tuple[int, int, int, int]
         A, warp = np.eye(2) + p[2:].reshape(2, 2), np.eye(3)
         warp[:2, :2], warp[:2, 2] = A, centre + p[:2] - A @ centre
         fine = shares(patch, warp @ H, box, step)
-        parts = binned(fine).reshape(3, -1).T
+        parts = binned(fine, step.sub).reshape(3, -1).T
         inks, *_ = np.linalg.lstsq(parts, seen.ravel(), rcond=None)
         # the gradient of a picture of points is smoothed a little, which changes the size of steps, not where they end
-        gy, gx = (binned(g) * SUB for g in np.gradient(gaussian_filter(np.tensordot(inks, fine, axes=1), SUB / 4)))
+        picture = np.tensordot(inks, fine, axes=1)
+        gy, gx = (binned(g, step.sub) * step.sub for g in np.gradient(gaussian_filter(picture, step.sub / 4)))
         J = -np.stack([gx, gy, gx * columns, gx * rows, gy * columns, gy * rows], axis=-1).reshape(-1, 6)
         move, *_ = np.linalg.lstsq(np.hstack([J, parts]), seen.ravel() - parts @ inks, rcond=None)
         p = p + move[:6]
@@ -196,7 +198,10 @@ def main() -> None:
         e = measure(step, options.draws if step.noisy else options.renders, options.seed)
         if step.noisy:
             error = np.hypot(*e.std(axis=0)) / np.sqrt(len(e))
-            print(f"{name:24} mean of {len(e)} draws {np.hypot(*e.mean(axis=0)):.4f} px (standard error {error:.4f})")
+            print(
+                f"{name:24} mean of {len(e)} draws {np.hypot(*e.mean(axis=0)):.4f} px (standard error {error:.4f})",
+                flush=True,
+            )
         else:
             rms = np.sqrt((e**2).sum(axis=1).mean())
             print(f"{name:24} RMS of {len(e)} renders {rms:.4f} px, worst {np.hypot(*e.T).max():.4f}", flush=True)
