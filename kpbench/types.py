@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import PredictionsError
+from kpbench.validity import as_whole, check_columns
 
 Int = NDArray[np.int64]
 Float = NDArray[np.float64]
@@ -184,24 +185,8 @@ class Truth:
         return whole.hexdigest()
 
 
-class InvalidValue(PredictionsError):
-    """A value of a predictions table is impossible.
-
-    Attributes
-    ----------
-    image : int
-        Position of the image in the table.
-    keypoint : int or None
-        Position of the keypoint within the image; None if the value belongs to the image.
-    image_id : int
-        Identity of the image.
-    problem : str
-        The impossible value and the expected value, without their place in the table.
-    """
-
-    def __init__(self, image: int, keypoint: int | None, image_id: int, problem: str) -> None:
-        super().__init__(f"predictions[{image}] (image_id {image_id}): {problem}")
-        self.image, self.keypoint, self.image_id, self.problem = image, keypoint, image_id, problem
+UNKNOWN: dict[str, Any] = {"file": "", "size": 0, "frame_index": -1, "time_s": np.nan, "ms": np.nan}
+"""Optional columns of the images in :class:`Predictions`, and the value that stands for an unknown one."""
 
 
 @dataclass(frozen=True)
@@ -220,6 +205,18 @@ class Predictions:
         Confidence. A higher score means a surer detection.
     patch_id : ndarray of shape (K,), int64, or None
         Identity of each point, 0 or more; None if the detector does not identify patches.
+    A_patch2image, covariance, blur_px : ndarray with K rows, float64, or None
+        As in :class:`Detections`. A covariance is symmetric and positive semi-definite.
+    file : tuple of N str, or None
+        Name of each image's file, as it was given; "" for none. All frames of a film have the name of the film.
+    size : ndarray of shape (N, 2), int64, or None
+        Width and height of each image, px; 0 if unknown.
+    frame_index : ndarray of shape (N,), int64, or None
+        Number of the frame in its film, from 0; -1 if unknown.
+    time_s : ndarray of shape (N,), float64, or None
+        Time of the frame, s from the start of its film; nan if unknown.
+    ms : ndarray of shape (N,), float64, or None
+        Time that the detector took, milliseconds; nan if unknown.
     detector : dict
         Name and settings of the detector, such as ``{"name": "superpoint", "version": "1"}``.
     dataset : str or None
@@ -254,6 +251,14 @@ class Predictions:
     dataset: str | None = None
     fingerprint: str | None = None
     truth_digest: str | None = None
+    A_patch2image: Float | None = None
+    covariance: Float | None = None
+    blur_px: Float | None = None
+    file: tuple[str, ...] | None = None
+    size: Int | None = None
+    frame_index: Int | None = None
+    time_s: Float | None = None
+    ms: Float | None = None
 
     def __post_init__(self) -> None:
         assign = object.__setattr__
@@ -263,7 +268,20 @@ class Predictions:
         assign(self, "score", np.ascontiguousarray(self.score, np.float64).reshape(-1))
         if self.patch_id is not None:
             assign(self, "patch_id", np.ascontiguousarray(self.patch_id, np.int64).reshape(-1))
-        _check(self)
+        for name in ("A_patch2image", "covariance", "blur_px"):
+            if getattr(self, name) is not None:
+                assign(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
+        for name, unknown in UNKNOWN.items():
+            values = getattr(self, name)
+            if values is not None and name != "file":
+                values = np.ascontiguousarray(values, np.float64) if np.isnan(unknown) else as_whole(name, values)
+                values = None if (np.isnan(values) | (values == unknown)).all() else values
+            elif values is not None:
+                values = tuple(values) if any(values) else None
+            assign(self, name, values)
+        check_columns(self)
+        if self.covariance is not None:  # symmetric to the last bit, as tables hold three numbers of each matrix
+            assign(self, "covariance", (self.covariance + self.covariance.transpose(0, 2, 1)) / 2)
 
     def __len__(self) -> int:
         return len(self.image_id)
@@ -277,44 +295,59 @@ class Predictions:
         dataset: str | None = None,
         fingerprint: str | None = None,
         truth_digest: str | None = None,
+        **of_images: Any,
     ) -> Predictions:
         """Make predictions from one :class:`Detections` per image.
 
         Parameters
         ----------
         detections : iterable of Detections
-            One element per image. All or none of the elements with detections have identities.
+            One element per image. All or none of the elements with detections have identities, and so have the other
+            optional columns.
         image_id : sequence of int, optional
             0, 1, 2, … if left out.
         detector, dataset, fingerprint, truth_digest
             See :class:`Predictions`.
+        **of_images
+            Columns of the images: `file`, `size`, `frame_index`, `time_s`, `ms`, see :class:`Predictions`.
 
         Raises
         ------
         PredictionsError
-            As raised by :class:`Predictions`, or if only some of the elements with detections have identities.
+            As raised by :class:`Predictions`, or if only some of the elements with detections have an optional column.
         """
-        found = list(detections)
-        named = [d.patch_id is not None for d in found if len(d)]
-        if any(named) and not all(named):
-            raise PredictionsError("some images have ids and others have none; give ids to all detections or to none")
-        ids = [d.patch_id for d in found if d.patch_id is not None and len(d)]
+        listed = list(detections)
+        found = [d for d in listed if len(d)]
+
+        def join(name: str, label: str) -> NDArray[Any] | None:
+            columns = [getattr(d, name) for d in found if getattr(d, name) is not None]
+            if columns and len(columns) < len(found):
+                raise PredictionsError(
+                    f"some images have {label} and others have none; give {label} to all detections or to none"
+                )
+            return np.concatenate(columns) if columns else None
+
         return cls(
-            image_id=np.arange(len(found)) if image_id is None else np.asarray(image_id, np.int64),
-            offsets=offsets_of([len(d) for d in found]),
+            image_id=np.arange(len(listed)) if image_id is None else np.asarray(image_id, np.int64),
+            offsets=offsets_of([len(d) for d in listed]),
             xy=np.concatenate([np.zeros((0, 2)), *(d.xy for d in found)]),
             score=np.concatenate([np.zeros(0), *(d.score for d in found)]),
-            patch_id=np.concatenate([np.zeros(0, np.int64), *ids]) if all(named) else None,
+            patch_id=join("patch_id", "ids") if found else np.zeros(0, np.int64),
             detector=detector or {},
             dataset=dataset,
             fingerprint=fingerprint,
             truth_digest=truth_digest,
+            A_patch2image=join("A_patch2image", "A_patch2image"),
+            covariance=join("covariance", "covariance"),
+            blur_px=join("blur_px", "blur_px"),
+            **of_images,
         )
 
     def detections(self) -> list[Detections]:
         """Return one :class:`Detections` per image, in the order of ``image_id``."""
+        columns = (self.xy, self.score, self.patch_id, self.A_patch2image, self.covariance, self.blur_px)
         return [
-            Detections(self.xy[a:b], self.score[a:b], None if self.patch_id is None else self.patch_id[a:b])
+            Detections(*(None if c is None else c[a:b] for c in columns))  # type: ignore[arg-type]
             for a, b in pairwise(self.offsets.tolist())
         ]
 
@@ -322,33 +355,3 @@ class Predictions:
 def offsets_of(counts: Sequence[int] | Int) -> Int:
     """Return the first row of each image and the number of all rows, shape (N + 1,), from N counts of rows."""
     return np.concatenate([[0], np.cumsum(counts, dtype=np.int64)]).astype(np.int64)
-
-
-def _check(p: Predictions) -> None:
-    """Check every rule of the columns, for files of all formats and for arrays made in memory."""
-    n, k = len(p.image_id), len(p.xy)
-    if len(p.offsets) != n + 1 or p.offsets[0] != 0 or p.offsets[-1] != k or np.any(np.diff(p.offsets) < 0):
-        raise PredictionsError(f"offsets do not run from 0 to {k} keypoints in {n} images")
-    ids = np.zeros(k, np.int64) if p.patch_id is None else p.patch_id
-    if len(p.score) != k or len(ids) != k:
-        raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {len(ids)} ids do not belong together")
-
-    if n and p.image_id.min() < 0:
-        i = int(np.argmax(p.image_id < 0))
-        raise InvalidValue(i, None, int(p.image_id[i]), "image_id is negative, expected 0 or more")
-    order = np.argsort(p.image_id, kind="stable")
-    repeated = np.flatnonzero(np.diff(p.image_id[order]) == 0)
-    if len(repeated):
-        first, second = order[repeated[0]], order[repeated[0] + 1]
-        raise InvalidValue(int(second), None, int(p.image_id[second]), f"the image occurs twice, first at {first}")
-    for name, column, valid, expected in (
-        ("keypoints", p.xy, np.isfinite(p.xy), "two finite numbers"),
-        ("scores", p.score, np.isfinite(p.score), "a finite number"),
-        ("ids", ids, ids >= 0, "a patch id, 0 or more"),
-    ):
-        if not valid.all():
-            row = int(np.argmin(valid.reshape(k, -1).all(axis=1)))
-            image = int(np.searchsorted(p.offsets, row, side="right")) - 1
-            keypoint = row - int(p.offsets[image])
-            problem = f"{name}[{keypoint}] is {column[row].tolist()}, expected {expected}"
-            raise InvalidValue(image, keypoint, int(p.image_id[image]), problem)

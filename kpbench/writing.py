@@ -2,7 +2,7 @@
 
 1. A file appears whole or not at all.
 2. A file that exists is replaced only if it is empty, or if kpbench wrote it as a file of the same kind. A mark in each
-   file names the kind: a text such as ``kpbench.predictions/1``, in the place that the form of the file has for it.
+   file names the kind: a text such as ``kpbench.predictions/2``, in the place that the form of the file has for it.
 3. A command never writes to a file that it reads.
 4. A symbolic link is followed. Data for a device or a pipe go into the device or pipe, which is not replaced.
 5. A new file gets its mode from the umask. A replaced file keeps its mode.

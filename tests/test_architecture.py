@@ -25,7 +25,8 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py") if path.name != "__main_
 
 GROUND = {
     "errors": [],
-    "types": ["errors"],
+    "validity": ["errors"],
+    "types": ["errors", "validity"],
     "portable": ["types"],
     "filters": ["types", "portable"],
     "files": ["errors"],
@@ -71,7 +72,7 @@ ROOMS = {
 LAST = "cli"
 """The room that may import every other one, and that no other may import."""
 TORCH_ROOM = "training"
-H5PY_MODULES = {"hdf5", "hdf5_structure", "dataset.shard", "predictions.table_files"}
+H5PY_MODULES = {"hdf5", "hdf5_structure", "dataset.shard", "predictions.h5_files"}
 ONNXRUNTIME_ROOMS = {"detectors", TORCH_ROOM}
 HEAVY = {"torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
 """Packages that neither ``import kpbench`` nor ``kpbench --help`` loads."""

@@ -36,7 +36,7 @@ from kpbench.predictions.decode import (
     require_utf8,
     split_lists,
 )
-from kpbench.predictions.table_files import build_predictions
+from kpbench.predictions.tables import build_predictions
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 IMAGES_LOOKED_AT = 20

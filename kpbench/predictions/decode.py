@@ -155,9 +155,13 @@ def require_single_keys(data: bytes, records: Sequence[Record], record: type[Rec
         if keys:
             return keys
     counts = dict.fromkeys(names, len(records))
-    for name, default in zip(names[len(names) - len(defaults) :], defaults, strict=True):
+    colons = data.count(b":")
+    optional = names[len(names) - len(defaults) :]
+    for name, default in zip(optional, defaults, strict=True):
         counts[name] -= list(map(attrgetter(name), records)).count(default)
-    if data.count(b":") != sum(counts.values()) and (
+        if name != optional[-1] and colons == sum(counts[n] for n in names[: names.index(name) + 1]):
+            return names[: names.index(name) + 1]  # no colon is left for a key of a later field
+    if colons != sum(counts.values()) and (
         b"\\" in data or any(data.count(b'"%s"' % name.encode()) != count for name, count in counts.items())
     ):
         load_json(data)

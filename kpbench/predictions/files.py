@@ -1,7 +1,7 @@
 """Read and write predictions files: the detections of a detector in every image of a dataset.
 
 In memory the predictions are columns (:class:`kpbench.Predictions`), so that a million images need only a few arrays. A
-file is ``.json`` (schema ``kpbench.predictions/1``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``. All formats hold
+file is ``.json`` (schema ``kpbench.predictions/2``), ``.jsonl``, ``.csv``, ``.parquet`` or ``.h5``. All formats hold
 the same content. ``docs/reference/predictions-format.md`` describes each format.
 """
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from kpbench.errors import PredictionsError, system_reason
 from kpbench.files import open_file
-from kpbench.predictions import json_files, table_files
+from kpbench.predictions import csv_files, h5_files, json_files, parquet_files
 from kpbench.predictions.decode import pause_gc
 from kpbench.types import Predictions
 from kpbench.writing import require_writable, write_file
@@ -20,17 +20,17 @@ from kpbench.writing import require_writable, write_file
 READERS: dict[str, Callable[[Path], Predictions]] = {
     ".json": json_files.read_json,
     ".jsonl": json_files.read_jsonl,
-    ".csv": table_files.read_csv,
-    ".parquet": table_files.read_parquet,
-    ".h5": table_files.read_h5,
+    ".csv": csv_files.read_csv,
+    ".parquet": parquet_files.read_parquet,
+    ".h5": h5_files.read_h5,
 }
 """For each file suffix, the function that reads the format."""
 ENCODERS: dict[str, Callable[[Predictions], bytes]] = {
     ".json": json_files.encode_json,
     ".jsonl": json_files.encode_jsonl,
-    ".csv": table_files.encode_csv,
-    ".parquet": table_files.encode_parquet,
-    ".h5": table_files.encode_h5,
+    ".csv": csv_files.encode_csv,
+    ".parquet": parquet_files.encode_parquet,
+    ".h5": h5_files.encode_h5,
 }
 """For each file suffix, the function that encodes the format."""
 

@@ -33,7 +33,7 @@ from kpbench.detectors.inference import TRIAL_BYTES, TRIAL_PX, TRIAL_SECONDS
 from kpbench.errors import DataError
 from kpbench.files import LARGEST_FILE, LARGEST_TEXT, PACKAGE, path_below, protect_read_files, read_bytes
 from kpbench.hdf5_structure import LARGEST_ATTRIBUTE, LARGEST_CHUNK, MOST_OBJECTS
-from kpbench.predictions.table_files import MOST_COLUMNS, MOST_EXPANSION, ROOM_BYTES
+from kpbench.predictions.parquet_files import MOST_COLUMNS, MOST_EXPANSION, ROOM_BYTES
 from kpbench.synth.synthetic import SynthConfig
 from kpbench.writing import write_file
 

@@ -175,7 +175,10 @@ BAD_RECORDS = [
     (record(image_id=2**63), f"(image_id {2**63}): image_id is {2**63}, expected a whole number of 64 bits"),
     (record(image_id="12"), "(image_id '12'): image_id is '12', expected a whole number"),
     (record(image_id=...), ": no image_id, expected a whole number"),
-    (record(labels=[1, 2]), "(image_id 12): unknown key 'labels', expected ids, image_id, keypoints, scores"),
+    (
+        record(labels=[1, 2]),
+        "(image_id 12): unknown key 'labels', expected A_patch2image, blur_px, covariance, file, frame_index, ids",
+    ),
     ([1, 2], " is a list, expected an object"),
 ]
 
@@ -203,7 +206,7 @@ BAD_FILES = [
     ("p.json", json.dumps({**HEADER, "predictions": [record()]})[:-9].encode(), "the file is cut off or no JSON"),
     ("p.json", b"\x89PNG\r\n", "the file is cut off or no JSON"),
     ("p.json", b"[" * 100_000, "the file is cut off or no JSON"),
-    ("p.json", b"3", "holds a number, expected an object with schema 'kpbench.predictions/1'"),
+    ("p.json", b"3", "holds a number, expected an object with schema 'kpbench.predictions/2'"),
     ("p.json", b"[3]", "results[0] is a number, expected an object"),
     (
         "p.json",
@@ -225,8 +228,8 @@ BAD_FILES = [
         b'[{"image_id": 1, "category_id": 1, "keypoints": [1, NaN, 2], "score": 1}]',
         "results[0] (image_id 1): y is blank, expected a finite number",
     ),
-    ("p.json", b"{}", "schema is missing, expected 'kpbench.predictions/1'"),
-    ("p.json", b'{"schema": "coco"}', "schema is 'coco', expected 'kpbench.predictions/1'"),
+    ("p.json", b"{}", "schema is missing, expected 'kpbench.predictions/2'"),
+    ("p.json", b'{"schema": "coco"}', "schema is 'coco', expected 'kpbench.predictions/2'"),
     ("p.json", json.dumps(HEADER).encode(), "predictions is missing or null, expected a list"),
     ("p.json", json.dumps({**HEADER, "model": 1, "predictions": []}).encode(), "unknown key 'model', expected dataset"),
     ("p.json", json.dumps({**HEADER, "dataset": 1, "predictions": []}).encode(), "dataset is a number, expected"),
@@ -421,7 +424,7 @@ def test_the_json_is_what_the_schema_says(tmp_path):
     write_predictions(path, p)
     content = json.loads(path.read_text())
     assert list(content) == ["schema", "dataset", "fingerprint", "detector", "predictions"]
-    assert content["schema"] == "kpbench.predictions/1"
+    assert content["schema"] == "kpbench.predictions/2"
     for n, (entry, d) in enumerate(zip(content["predictions"], p.detections(), strict=True)):
         assert entry == {
             "image_id": int(p.image_id[n]),
@@ -514,20 +517,25 @@ ROOT = Path(__file__).parents[2]
 
 
 def test_the_published_schema_says_what_the_reader_says(tmp_path):
-    schema = json.loads((ROOT / "docs" / "schemas" / "predictions-1.json").read_text())
+    schema = json.loads((ROOT / "docs" / "schemas" / "predictions-2.json").read_text())
     validator = jsonschema.Draft202012Validator(schema)
     validator.check_schema(schema)
-    detections = [Detections([[1.5, 2]], [0.5], [3]), Detections.none()]
-    p = Predictions.from_detections(detections, detector={"name": "mine"}, dataset="d", fingerprint="f" * 64)
+    full = Detections([[1.5, 2]], [0.5], [3], [np.eye(2)], [np.eye(2)], [1.0])
+    of_images = {"file": ("a", ""), "size": [[3, 4], [0, 0]], "frame_index": [0, -1], "ms": [1.5, np.nan]}
+    about = {"detector": {"name": "mine"}, "dataset": "d", "fingerprint": "f" * 64}
+    p = Predictions.from_detections([full, Detections.none()], **about, **of_images)
     write_predictions(tmp_path / "p.json", p)
     assert not list(validator.iter_errors(json.loads((tmp_path / "p.json").read_text())))
     good = {"image_id": 0, "keypoints": [[1, 2]], "scores": [1], "ids": [0]}
     changes = [
         {}, {"ids": None}, {"image_id": -1}, {"image_id": 1.5}, {"keypoints": [[1, 2, 3]]}, {"keypoints": [["1", 2]]},
         {"scores": ["1"]}, {"ids": [-1]}, {"ids": [0.5]}, {"score": [1]}, {"keypoints": None},
+        {"covariance": [[[1, 0], [0, 1]]]}, {"covariance": [[1, 0]]}, {"blur_px": [-1]}, {"blur_px": [0]},
+        {"A_patch2image": [[[1, 0], [0]]]}, {"file": "a"}, {"file": 1}, {"size": [3, 4]}, {"size": [3]},
+        {"size": [0, 4]}, {"size": [3.5, 4]}, {"frame_index": -1}, {"frame_index": None}, {"time_s": -1}, {"ms": -1},
     ]  # fmt: skip
     for change in changes:
-        content = {"schema": "kpbench.predictions/1", "predictions": [good | change]}
+        content = {"schema": "kpbench.predictions/2", "predictions": [good | change]}
         (tmp_path / "q.json").write_text(json.dumps(content))
         try:
             read_predictions(tmp_path / "q.json")
