@@ -10,6 +10,7 @@ from .report import Report as Report
 from .report import write_report as write_report
 from .score_charts import Figure as Figure
 from .score_charts import severity_chart as severity_chart
+from .score_tables import bias_table as bias_table
 from .score_tables import breakpoint_table as breakpoint_table
 from .score_tables import difference_table as difference_table
 from .score_tables import group_table as group_table

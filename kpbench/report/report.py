@@ -25,12 +25,14 @@ from kpbench.report.score_charts import (
     taxonomy_charts,
 )
 from kpbench.report.score_tables import (
+    bias_table,
     breakpoint_table,
     condition_table,
     confusion_table,
     count_table,
     difference_table,
     group_table,
+    nees_table,
     overview_table,
     paper_table,
     synthetic_table,
@@ -124,6 +126,7 @@ def make_sections(report: Report) -> list[Section]:
         _severity_section,
         _precision_recall_section,
         _radius_section,
+        _bias_section,
         _pose_section,
         _identity_section,
         _worst_cases_section,
@@ -191,6 +194,15 @@ def _radius_section(report: Report) -> Section:
         blocks = (*charts, *(group_table(groups, f"By radius: {run.name}") for run, groups in bins))
     lead = "Only matches have errors, so no error exceeds the matching threshold."
     return Section("Localisation by radius", lead, blocks)
+
+
+def _bias_section(report: Report) -> Section:
+    runs = report.runs
+    if all(run["bias_px"] is None and run["sigma_median_px"] is None for run in runs):
+        return Section("Bias and uncertainty", "", ())
+    lead = "The mean error apart from the scatter about it, and how the errors compare with the predicted covariances."
+    tables = (bias_table(runs, report.patch_names), *(nees_table(run) for run in runs if run.nees_by_sigma))
+    return Section("Bias and uncertainty", lead, tables)
 
 
 def _pose_section(report: Report) -> Section:

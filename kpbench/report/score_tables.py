@@ -10,9 +10,10 @@ from kpbench.report.tables import Cell, Estimate, Table
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import DETECTION_SCORE_LIMIT, Breakpoint, find_breakpoints
 from kpbench.scoring.comparison import COMPARED_METRICS, Comparison
-from kpbench.scoring.groups import Group
+from kpbench.scoring.groups import Group, GroupKey
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
+from kpbench.scoring.uncertainty import UNCERTAINTY_METRICS
 
 SHORT_LABELS = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
 """Labels of the paper's metrics in narrow columns."""
@@ -230,6 +231,41 @@ def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
     names = [str(patches.get(i, i)) for i in run.confusion["ids"]]
     rows = tuple((name, *cells) for name, cells in zip(names, run.confusion["matrix"], strict=True))
     return Table(f"IDs of matched detections: {run.name}", ("true", *names, "other"), rows, shade=True)
+
+
+def bias_table(runs: Sequence[Scores], patches: Mapping[int, str] | None = None) -> Table:
+    """Tabulate bias, scatter, predicted standard deviation and NEES: a row per detector, and per detector and patch.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.bias_table([scores]).rows[0][:2]
+    ('oracle', 'all')
+    """
+    metrics = ("error_rms_px", *UNCERTAINTY_METRICS)
+    rows: list[tuple[Cell, ...]] = []
+    for run in runs:
+        for group in (run.overall, *(g for g in run.by if g.key == GroupKey(patch_id=g.patch_id))):
+            patch = "all" if group.patch_id is None else str((patches or {}).get(group.patch_id, group.patch_id))
+            rows.append((run.name, patch, group.counts["matched"], *(get_estimate(group, name) for name in metrics)))
+    note = (
+        "Bias is the mean error of matched keypoints in the frame of the patch, so biases of different patches may "
+        "cancel in the row of all. NEES is 2 where the predicted covariances are right, and more where they are too "
+        "small."
+    )
+    columns = ("detector", "patch", "matched", *(LABELS[name] for name in metrics))
+    return Table("Bias and uncertainty", columns, tuple(rows), note)
+
+
+def nees_table(run: Scores) -> Table:
+    """Tabulate the NEES in each quintile of the predicted standard deviation, one row per quintile."""
+    rows = tuple(
+        (f"{low:.3g} to {high:.3g}", part["matched"], Estimate(part["nees"], part["interval"]))
+        for part in run.nees_by_sigma
+        for low, high in [part["sigma_px"]]
+    )
+    return Table(f"NEES by predicted sigma: {run.name}", ("predicted sigma (px)", "matched", LABELS["nees"]), rows)
 
 
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kpbench.report.score_tables import difference_table, group_table, pose_table, verdict_table
+from kpbench.report.score_tables import difference_table, group_table, nees_table, pose_table, verdict_table
 from kpbench.report.tables import Estimate, Table, cell_text, to_plain
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.comparison import Comparison
@@ -53,8 +53,11 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
         matrix = tuple((i, *row) for i, row in zip(ids, scores.confusion["matrix"], strict=True))
         lines += ["", "ID of matched detections: true in rows, detected in columns"]
         lines.append(to_plain(Table("", ("", *ids, "other"), matrix)))
+    if scores.nees_by_sigma:
+        lines += ["", _with_title(nees_table(scores))]
     if scores.by:
-        lines += ["", to_plain(group_table(scores.by, "", errors=["error_median_px"]), 4)]
+        errors = ["error_median_px", *(m for m in ("bias_px", "nees") if overall.metrics[m] is not None)]
+        lines += ["", to_plain(group_table(scores.by, "", errors=errors), 4)]
     if poses:
         lines += ["", _with_title(pose_table(scores, poses))]
     return "\n".join(lines)

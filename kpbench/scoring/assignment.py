@@ -66,6 +66,8 @@ class DetectionPoints:
         Index of the image, from 0.
     patch_id : ndarray of shape (D,), int64, or None
         Detected identity. Only :attr:`Matches.contradicted` depends on it.
+    covariance : ndarray of shape (D, 2, 2), float64, or None
+        Predicted covariance of the error of ``xy``, px². The matches do not depend on it.
 
     Examples
     --------
@@ -80,6 +82,7 @@ class DetectionPoints:
     score: Float
     image: Int
     patch_id: Int | None = None
+    covariance: Float | None = None
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,7 @@ def bootstrap_intervals(
     Parameters
     ----------
     sums : ndarray of shape (C, M)
-        Counts per scene, whole numbers.
+        Counts or sums per scene.
     statistics : function
         Function that computes named values of shape (...) from sums of shape (..., M). An undefined value is nan.
     resamples : int
@@ -139,10 +139,13 @@ def _percentile_levels(values: Float, found: float, without_one: Float, count: I
 
 
 def _unique_rows(table: NDArray[Any]) -> tuple[NDArray[Any], Int]:
-    """Return the distinct rows of a table of whole numbers, in lexicographic order, and the count of each row.
+    """Return the distinct rows of a table, in lexicographic order, and the count of each row.
 
-    Each row is packed into one integer if 62 bits suffice. Sorting integers is many times faster than sorting rows.
+    Rows of whole numbers are packed into one integer each if 62 bits suffice. Sorting integers is many times faster
+    than sorting rows. Other rows are sorted, but equal ones stay apart.
     """
+    if table.dtype.kind == "f":
+        return table[np.lexsort(table.T[::-1])], np.ones(len(table), np.int64)
     least = table.min(axis=0)
     sizes = (table.max(axis=0) - least).astype(object) + 1
     if np.prod(sizes) >= 2**62:

@@ -21,6 +21,12 @@ from kpbench.scoring.metrics import (
     compute_ratios,
 )
 from kpbench.scoring.outcomes import Outcomes
+from kpbench.scoring.uncertainty import (
+    MatchedErrors,
+    compute_uncertainty_metrics,
+    estimate_nees_interval,
+    measure_errors,
+)
 from kpbench.types import Float, Int
 
 RADIUS_EDGES_PX = (0, 5, 10, 20, 40, 80, np.inf)
@@ -74,7 +80,7 @@ class Group:
     counts : dict of str to int or None
         The value of each of :data:`kpbench.scoring.COUNTS`; None if the count is undefined for the group.
     intervals : dict of str to (low, high) or None
-        95 % bootstrap intervals of the metrics that are ratios of counts.
+        95 % bootstrap intervals of the metrics that are ratios of counts, and of ``nees``.
 
     Examples
     --------
@@ -128,6 +134,8 @@ class _Units(NamedTuple):
     outcomes: Outcomes
     ranked: tuple[_Ranked, _Ranked, _Ranked]
     """The scores of all detections, and the errors of all matched keypoints in px and in radii."""
+    errors: MatchedErrors
+    """The errors of all matched keypoints, in the order of their errors in px."""
     sums: Int
     """Counts of each unit, of shape (M, 9), in the order of SUMS."""
     scene: Int
@@ -162,10 +170,13 @@ class _Units(NamedTuple):
         hit = outcomes.matches.kind[self.ranked[0].row[ranks[0]]] == MATCHED
         metrics["average_precision"] = compute_average_precision(score, hit, n["truths"])
         metrics |= compute_error_metrics(*errors)
+        of_errors = self.errors.select(ranks[1])
+        metrics |= compute_uncertainty_metrics(of_errors)
         scenes = sum_by_scene(sums, self.scene[units])
         intervals = bootstrap_intervals(
             scenes, lambda s: compute_ratios(s, settings.matching), settings.resamples, settings.seed
         )
+        intervals["nees"] = estimate_nees_interval(of_errors, settings.resamples, settings.seed)
         n |= {
             "scenes": len(scenes),
             "wrong_id": n["matched"] - n["id_correct"],
@@ -197,14 +208,24 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     truth, n = outcomes.truth, len(outcomes.truth)
     image_of_truth, image_of_detection = outcomes.truth_points.image, outcomes.detections.image
     matched = np.flatnonzero(outcomes.matched)
+    errors = measure_errors(outcomes, matched)
+    order = errors.rank(outcomes.matches.distance[matched])
+    matched, errors = matched[order], errors.select(order)
     distance = outcomes.matches.distance[matched]
     ranked = (
         _Ranked(outcomes.ranking, outcomes.detections.score[outcomes.ranking]),
-        _Ranked.of(matched, distance),
+        _Ranked(matched, distance),
         _Ranked.of(matched, distance / outcomes.truth_points.radius[matched]),
     )
     images = _Units(
-        outcomes, ranked, outcomes.image_sums, truth.scene_id, image_of_truth, image_of_detection, np.zeros(n, bool)
+        outcomes,
+        ranked,
+        errors,
+        outcomes.image_sums,
+        truth.scene_id,
+        image_of_truth,
+        image_of_detection,
+        np.zeros(n, bool),
     )
     yield from images.group([GroupKey()], np.zeros(n, np.int64))
 
@@ -262,7 +283,11 @@ def _divide_images(images: _Units, label: Int, labels: int) -> tuple[Int, Int, _
     of_detection = unit_of_image[images.of_detection]
     sums = outcomes.sum_rows(of_truth, of_detection, len(unit))
     scene = outcomes.truth.scene_id[of_image]
-    return of_image, of_label, _Units(outcomes, images.ranked, sums, scene, of_truth, of_detection, shared)
+    return (
+        of_image,
+        of_label,
+        _Units(outcomes, images.ranked, images.errors, sums, scene, of_truth, of_detection, shared),
+    )
 
 
 def _number(values: Int) -> tuple[Int, Int]:

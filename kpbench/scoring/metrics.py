@@ -36,7 +36,7 @@ RATIOS = (
     "recall",
     "f1",
 )
-"""Names of the metrics that are ratios of sums. Only these metrics have intervals."""
+"""Names of the metrics that are ratios of counts. Only these metrics and ``nees`` have intervals."""
 
 METRICS = (
     *RATIOS,
@@ -47,6 +47,13 @@ METRICS = (
     "error_median_radii",
     "error_p95_radii",
     "error_rms_radii",
+    "bias_px",
+    "bias_u_px",
+    "bias_v_px",
+    "bias_tilt_px",
+    "scatter_px",
+    "sigma_median_px",
+    "nees",
 )
 """Names of all metrics, as in the scores file."""
 
@@ -87,6 +94,13 @@ LABELS = {
     "error_median_radii": "error, median (radii)",
     "error_p95_radii": "error, 95th percentile (radii)",
     "error_rms_radii": "error, RMS (radii)",
+    "bias_px": "bias (px)",
+    "bias_u_px": "bias along u of the patch (px)",
+    "bias_v_px": "bias along v of the patch (px)",
+    "bias_tilt_px": "bias along the tilt (px)",
+    "scatter_px": "scatter, RMS (px)",
+    "sigma_median_px": "predicted sigma, median (px)",
+    "nees": "NEES",
 }
 """The label of each metric in tables and charts."""
 

@@ -77,7 +77,7 @@ class Outcomes:
     truth_id : ndarray of shape (T,), int64
         True identity.
     detections : DetectionPoints
-        Place, score, image and identity of each detection. The image is an index into ``truth``.
+        Place, score, image, identity and covariance of each detection. The image is an index into ``truth``.
     matches : Matches
     correct : ndarray of shape (T,), bool
         Whether the true keypoint is matched by a detection of the right identity, and the identity is not contradicted
@@ -201,7 +201,7 @@ def match_predictions(
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
     # Predictions without detections hold no IDs, but the detector may know IDs: keep the ID counts defined
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
-    detections = DetectionPoints(predictions.xy, predictions.score, image, ids)
+    detections = DetectionPoints(predictions.xy, predictions.score, image, ids, predictions.covariance)
     matches = match(points, detections, settings.eps)
     correct, literally_correct = np.zeros(len(truth_id), bool), np.zeros(len(image), bool)
     if ids is not None:

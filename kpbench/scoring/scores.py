@@ -27,6 +27,7 @@ from kpbench.scoring.assignment import MATCHED, count_matches
 from kpbench.scoring.groups import Group, GroupKey, make_groups
 from kpbench.scoring.metrics import count_above_thresholds
 from kpbench.scoring.outcomes import Outcomes, Settings, match_predictions
+from kpbench.scoring.uncertainty import compute_nees_by_sigma
 from kpbench.types import Detections, Predictions, Truth
 
 SCHEMA = "kpbench.scores/1"
@@ -121,6 +122,14 @@ class Scores:
             "average_false_alarm": [(detections - n) / images for n in counts],
         }
 
+    @cached_property
+    def nees_by_sigma(self) -> list[dict[str, Any]]:
+        """``nees`` with its interval in each quintile of the predicted standard deviation; empty without covariances.
+
+        ``sigma_px`` is the range of the standard deviations, ``matched`` the number of matched keypoints.
+        """
+        return compute_nees_by_sigma(self.outcomes)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return a flat table: a row over all images, then a row per group.
 
@@ -151,6 +160,7 @@ class Scores:
             "confusion": self.confusion,
             "curve": self.curve,
             "eps_curve": self.eps_curve,
+            "nees_by_sigma": self.nees_by_sigma,
         }
 
 
