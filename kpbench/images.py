@@ -6,6 +6,7 @@ Images are uint8, grey (H, W) or RGB (H, W, 3).
 from __future__ import annotations
 
 import errno
+import math
 import os
 import secrets
 import struct
@@ -56,6 +57,8 @@ class ImageSource:
         decoded.
     names : tuple of str or None
         The names of all images; None if they are the numbers of frames, such as ``00000012.png``.
+    folder : str
+        Folder of the images, as it was given; "" for none.
     """
 
     images: Iterator[tuple[str, UInt8 | None]]
@@ -64,6 +67,23 @@ class ImageSource:
     film: str = ""
     problems: dict[str, str] = field(default_factory=dict)
     names: tuple[str, ...] | None = None
+    folder: str = ""
+
+    def locate(self, name: str) -> tuple[str, int, float]:
+        """Return the file of an image, the number of its frame (-1 for none), and the time of the frame, s (or nan).
+
+        Examples
+        --------
+        >>> from kpbench.images import ImageSource
+        >>> ImageSource(iter(()), 0, folder="photos").locate("a.png")
+        ('photos/a.png', -1, nan)
+        >>> ImageSource(iter(()), None, 25.0, "film.mp4").locate("00000050.png")
+        ('film.mp4', 50, 2.0)
+        """
+        if not self.film:
+            return (Path(self.folder) / name).as_posix(), -1, math.nan
+        frame = int(Path(name).stem)
+        return self.film, frame, frame / self.fps if self.fps else math.nan
 
     def describe_failures(self, failures: Sequence[tuple[str, str]]) -> list[str]:
         """Return failures, each a name and a message, in lines; one line for all frames with the same message."""
@@ -101,7 +121,9 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
         problems: dict[str, str] = {}
-        return ImageSource(_read_folder(path, files, problems), len(files), problems=problems, names=files)
+        return ImageSource(
+            _read_folder(path, files, problems), len(files), problems=problems, names=files, folder=source
+        )
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -111,7 +133,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         return _source_of(image, source)
     if isinstance(image, str):
         raise DataError(f"{path}: {image}{' as an image of at most 200 megapixels' if image == UNDECODABLE else ''}")
-    return ImageSource(iter([(path.name, image)]), 1, names=(path.name,))
+    return ImageSource(iter([(path.name, image)]), 1, names=(path.name,), folder=str(path.parent))
 
 
 def refuse_same_folder(source: str | Path, target: Path) -> None:

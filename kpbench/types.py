@@ -143,6 +143,8 @@ class Truth:
         Fingerprint of the dataset; "" for none.
     recipe : str
         SHA-256 of the dataset's config without the software that made the pixels; "" for none.
+    file : tuple of N str, or None
+        Name of each image's file; "" for none. The datasets of :func:`kpbench.generate` have no such names.
 
     Examples
     --------
@@ -162,6 +164,7 @@ class Truth:
     scene_id: NDArray[np.int64]
     fingerprint: str = ""
     recipe: str = ""
+    file: tuple[str, ...] | None = None
 
     def __len__(self) -> int:
         return len(self.image_id)

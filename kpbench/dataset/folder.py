@@ -204,7 +204,7 @@ class Dataset:
         names = ("image_id", "keypoints", "condition", "rung", "scene_id")
         offsets, *columns = zip(*self._read_columns(("offsets", *names)), strict=True)
         counts = np.concatenate([np.diff(part) for part in offsets])
-        whole = dict(zip(names, map(np.concatenate, columns), strict=True))
+        whole: dict[str, Any] = dict(zip(names, map(np.concatenate, columns), strict=True))
         recipe = canonical_json({key: value for key, value in self.config.items() if key != "pixels"})
         return Truth(
             **whole,

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import time
 import traceback
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -47,8 +50,16 @@ class PredictionRun:
     failures: tuple[tuple[str, str], ...]
 
 
-ImageResult = tuple[Detections, str]
-"""Detections in an image, and the error message; the message is "" if the image did not fail."""
+class ImageResult(NamedTuple):
+    """What a detector found in an image."""
+
+    detections: Detections
+    problem: str = ""
+    """The error message; "" if the image did not fail."""
+    size: tuple[int, int] = (0, 0)
+    """Width and height, px; 0 for an image that cannot be decoded."""
+    ms: float = math.nan
+    """Time that the detector took, milliseconds; nan for an image that failed."""
 
 
 def predict(
@@ -112,7 +123,7 @@ def predict(
         for results in run_jobs(work, pieces, workers, progress):
             found.update(results)
         for n in range(count) if overlay is not None else ():
-            draw(names[n], draw_detections(dataset.image(n), found[n][0]))
+            draw(names[n], draw_detections(dataset.image(n), found[n].detections))
     labels = [f"image_id {image_id}" for image_id in ids]
     return _collect(loaded, [found[n] for n in range(count)], labels, ids, dataset)
 
@@ -162,13 +173,13 @@ def predict_images(
     with image_writer(overlay, source.length, source.fps, source.names) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
             if image is None:
-                result = (Detections.none(), source.problems.get(label, UNDECODABLE))
+                result = ImageResult(Detections.none(), source.problems.get(label, UNDECODABLE))
             else:
                 result = _detect(loaded, image, threshold)
                 inverted.look(label, image, result[0])
             found.append(result)
             labels.append(label)
-            draw(label, None if image is None else draw_detections(image, result[0]))
+            draw(label, None if image is None else draw_detections(image, result.detections))
             progress(1)
     return _collect(loaded, found, labels, np.arange(len(found)), source)
 
@@ -176,28 +187,42 @@ def predict_images(
 def _collect(
     detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
 ) -> PredictionRun:
-    failures = tuple((label, message) for label, (_, message) in zip(labels, found, strict=True) if message)
+    failures = tuple((label, r.problem) for label, r in zip(labels, found, strict=True) if r.problem)
     if found and len(failures) == len(found):
         if isinstance(source, ImageSource):
             first = source.describe_failures(failures)[0]
         else:
-            first = f"{source.path}, {labels[0]}: {found[0][1]}"
+            first = f"{source.path}, {labels[0]}: {found[0].problem}"
         raise DataError(f"detector {detector.name}: failed on all {len(found)} images, first {first}")
     about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
-    of_dataset: dict[str, str] = {}
+    of_dataset: dict[str, Any] = {"size": [r.size for r in found], "ms": [r.ms for r in found]}
     if isinstance(source, Dataset):
-        of_dataset = {"dataset": str(source.path), "fingerprint": source.fingerprint}
+        of_dataset |= {"dataset": str(source.path), "fingerprint": source.fingerprint}
         of_dataset["truth_digest"] = source.truth.digest
-    predictions = Predictions.from_detections([detections for detections, _ in found], ids, about, **of_dataset)
+    elif found:
+        located = zip(*map(source.locate, labels), strict=True)
+        of_dataset |= dict(zip(("file", "frame_index", "time_s"), located, strict=True))
+    predictions = Predictions.from_detections([r.detections for r in found], ids, about, **of_dataset)
     return PredictionRun(predictions, failures)
 
 
 def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> ImageResult:
+    start = time.perf_counter()
     try:
         found = detector(image)
     except (Exception, SystemExit) as error:  # a user's detector may raise any exception
-        return Detections.none(), f"{type(error).__name__}: {in_one_line(error)}{_user_line(error)}"
-    return _apply_threshold(found, threshold), ""
+        problem = f"{type(error).__name__}: {in_one_line(error)}{_user_line(error)}"
+        return ImageResult(Detections.none(), problem, _size(image))
+    return ImageResult(_apply_threshold(found, threshold), "", _size(image), _ms_since(start))
+
+
+def _size(image: UInt8) -> tuple[int, int]:
+    return image.shape[1], image.shape[0]
+
+
+def _ms_since(start: float) -> float:
+    """Return the time since ``start``, milliseconds, to the microsecond."""
+    return round(1000 * (time.perf_counter() - start), 3)
 
 
 def _apply_threshold(found: Detections, threshold: float | None) -> Detections:
@@ -231,14 +256,20 @@ def detect_images(
     Returns
     -------
     dict
-        Position → detections and error message, see :data:`ImageResult`.
+        Position → :class:`ImageResult`.
     """
     loaded = _load_once(detector, threshold) if isinstance(detector, str) else detector
     if loaded.run_many is not None:
         with contextlib.suppress(Exception):  # after an error, the loop below tries the images one by one
-            batch = loaded.detect_many([dataset.image(n) for n in positions])
+            images = [dataset.image(n) for n in positions]
+            start = time.perf_counter()
+            batch = loaded.detect_many(images)
+            ms = round(_ms_since(start) / len(images), 3)
             progress(len(positions))
-            return {n: (_apply_threshold(found, threshold), "") for n, found in zip(positions, batch, strict=True)}
+            return {
+                n: ImageResult(_apply_threshold(found, threshold), "", _size(image), ms)
+                for n, image, found in zip(positions, images, batch, strict=True)
+            }
     results: dict[int, ImageResult] = {}
     for n in positions:
         results[n] = _detect(loaded, dataset.image(n), threshold)

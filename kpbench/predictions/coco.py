@@ -137,7 +137,7 @@ def open_coco(path: str | Path) -> CocoDataset:
             fingerprint = hashlib.sha256(data).hexdigest()
         del data  # its memory is used again
         truth = _make_truth(images, annotations, fingerprint)
-        files = tuple(images["file_name"].tolist())
+        files = truth.file or ("",) * len(truth)
         _warn_of_orientation(path, images)
         _warn_of_keypoints_outside(path, images, truth)
         return CocoDataset(path, truth, files)
@@ -249,6 +249,7 @@ def _make_truth(images: Columns, annotations: Columns, fingerprint: str) -> Trut
         rung=images["rung"],
         scene_id=np.where(images["scene_id"] < 0, ids, images["scene_id"]),
         fingerprint=fingerprint,
+        file=tuple(images["file_name"].tolist()) if any(images["file_name"]) else None,
     )
 
 

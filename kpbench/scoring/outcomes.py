@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from kpbench.errors import DataError
 from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
-from kpbench.scoring.fingerprint import find_images
+from kpbench.scoring.fingerprint import find_images, warn_of_ids
 from kpbench.types import Int, Predictions, Truth
 
 
@@ -180,7 +180,8 @@ def match_predictions(
     Raises
     ------
     PredictionsError
-        If the predictions name unknown images, lack images, or name the fingerprint of another dataset.
+        If the predictions name unknown images, lack images, or name the fingerprint of another dataset, or if the
+        names of files contradict the image IDs.
     DataError
         If there are no images, two images share an image_id, a place is not finite, or a radius is not a positive
         number.
@@ -203,6 +204,7 @@ def match_predictions(
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
     detections = DetectionPoints(predictions.xy, predictions.score, image, ids, predictions.covariance)
     matches = match(points, detections, settings.eps)
+    warn_of_ids(truth, predictions, int(np.count_nonzero(matches.detection >= 0)))
     correct, literally_correct = np.zeros(len(truth_id), bool), np.zeros(len(image), bool)
     if ids is not None:
         t, d = np.flatnonzero(matches.detection >= 0), np.flatnonzero(matches.nearest >= 0)

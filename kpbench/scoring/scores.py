@@ -236,7 +236,8 @@ def score(
     Raises
     ------
     PredictionsError
-        If the predictions name unknown images, lack images, or name the fingerprint of another dataset.
+        If the predictions name unknown images, lack images, or name the fingerprint of another dataset, or if the
+        names of files contradict the image IDs.
     DataError
         If the truth has no images, two of its images share an image_id, a place is not finite, or a radius is not a
         positive number.
