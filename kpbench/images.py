@@ -6,7 +6,6 @@ Images are uint8, grey (H, W) or RGB (H, W, 3).
 from __future__ import annotations
 
 import errno
-import math
 import os
 import secrets
 import struct
@@ -70,20 +69,20 @@ class ImageSource:
     folder: str = ""
 
     def locate(self, name: str) -> tuple[str, int, float]:
-        """Return the file of an image, the number of its frame (-1 for none), and the time of the frame, s (or nan).
+        """Return the file of an image, the number of its frame (-1 for none), and its time in the film, s (nan for none).
 
         Examples
         --------
         >>> from kpbench.images import ImageSource
         >>> ImageSource(iter(()), 0, folder="photos").locate("a.png")
         ('photos/a.png', -1, nan)
-        >>> ImageSource(iter(()), None, 25.0, "film.mp4").locate("00000050.png")
+        >>> ImageSource(iter(()), 100, 25.0, "film.mp4").locate("00000050.png")
         ('film.mp4', 50, 2.0)
         """
         if not self.film:
-            return (Path(self.folder) / name).as_posix(), -1, math.nan
+            return (Path(self.folder) / name).as_posix(), -1, np.nan
         frame = int(Path(name).stem)
-        return self.film, frame, frame / self.fps if self.fps else math.nan
+        return self.film, frame, frame / self.fps if self.fps and self.length is not None else np.nan
 
     def describe_failures(self, failures: Sequence[tuple[str, str]]) -> list[str]:
         """Return failures, each a name and a message, in lines; one line for all frames with the same message."""

@@ -25,6 +25,7 @@ from kpbench.files import read_bytes
 from kpbench.opencv import opencv_version
 from kpbench.patches.design import Patch
 from kpbench.types import Detections, UInt8
+from kpbench.validity import is_covariance
 
 DETECTORS = {
     "template": "kpbench.detectors.template:TemplateDetector",
@@ -86,8 +87,8 @@ class LoadedDetector:
     Raises
     ------
     DataError
-        On a call, if the result is not :class:`Detections`, if a patch ID is negative, or if a coordinate or a score is
-        not finite.
+        On a call, if the result is not :class:`Detections`, or if one of its values is impossible, such as a negative
+        patch ID or a coordinate that is not finite.
 
     Examples
     --------
@@ -124,6 +125,12 @@ class LoadedDetector:
             raise DataError(f"detector {self.name}: returned {type(found).__name__}, expected kpbench.Detections")
         if not (np.isfinite(found.xy).all() and np.isfinite(found.score).all()):
             raise DataError(f"detector {self.name}: returned a coordinate or score that is not finite")
+        if found.covariance is not None and not is_covariance(found.covariance).all():
+            raise DataError(f"detector {self.name}: returned a covariance that is not positive semi-definite")
+        if found.A_patch2image is not None and not np.isfinite(found.A_patch2image).all():
+            raise DataError(f"detector {self.name}: returned an affine frame that is not finite")
+        if found.blur_px is not None and not ((found.blur_px >= 0) & (found.blur_px < np.inf)).all():
+            raise DataError(f"detector {self.name}: returned a blur that is negative or not finite")
         if found.patch_id is not None and np.any(found.patch_id < 0):
             raise DataError(f"detector {self.name}: returned the patch id {found.patch_id.min()}, expected 0 or more")
         return found

@@ -1,4 +1,5 @@
 import os
+import re
 import sys
 import types
 from contextlib import nullcontext
@@ -79,7 +80,26 @@ def test_workers_change_nothing(folder, plug):
     generate(SynthConfig(40, size_px=(96, 96)), "set", workers=1)
     for n in (1, 2):
         kpbench("detect", "set", "--detector", f"{plug}:brightest", "--workers", n, "--out", f"{n}.json")
-    assert (folder / "1.json").read_bytes() == (folder / "2.json").read_bytes()
+    one, two = (re.sub(r'"ms":[0-9.]+', "", (folder / f"{n}.json").read_text()) for n in (1, 2))
+    assert one == two
+
+
+def test_each_image_has_its_file_size_and_time(folder, plug):
+    photos(folder)
+    (folder / "photos" / "sub" / "broken.png").write_bytes(b"no image")
+    kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--out", "p.json", code=1)
+    p = read_predictions("p.json")
+    assert p.file == ("photos/0.png", "photos/sub/1.png", "photos/sub/2.png", "photos/sub/broken.png")
+    assert p.size.tolist() == [[80, 60]] * 3 + [[0, 0]]
+    assert (p.ms[:3] > 0).all()
+    assert np.isnan(p.ms[3])
+    assert (p.frame_index, p.time_s) == (None, None)
+    kpbench("detect", "photos/0.png", "--detector", f"{plug}:brightest", "--out", "one.json")
+    assert read_predictions("one.json").file == ("photos/0.png",)
+    generate(SynthConfig(2, size_px=(96, 80)), "set", workers=1)
+    kpbench("detect", "set", "--detector", f"{plug}:brightest", "--out", "set.json")
+    of_set = read_predictions("set.json")
+    assert (of_set.file, of_set.size.tolist(), len(of_set.ms)) == (None, [[96, 80]] * 2, 2)
 
 
 def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
@@ -122,7 +142,10 @@ def test_a_video_and_its_overlay(folder, plug):
         writer.write(frame)
     writer.release()
     kpbench("detect", "in.mp4", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", "--threshold", 0.5)
-    x = read_predictions("preds.json").xy[:, 0]
+    p = read_predictions("preds.json")
+    assert (p.file, p.frame_index.tolist(), p.size.tolist()) == (("in.mp4",) * 5, [*range(5)], [[96, 64]] * 5)
+    np.testing.assert_allclose(p.time_s, np.arange(5) / 10)
+    x = p.xy[:, 0]
     assert len(x) == 5
     assert (np.abs(x - (15 + 8 * np.arange(5))) <= 8).all()
     assert cv2.VideoCapture("out.mp4").get(cv2.CAP_PROP_FRAME_COUNT) == 5

@@ -122,6 +122,6 @@ def test_a_detector_that_exits_fails_on_its_image():
     def leave(image):
         raise SystemExit(3)
 
-    found, message = prediction._detect(LoadedDetector("leaver", "1", leave), np.zeros((8, 8), np.uint8), None)
-    assert len(found) == 0
-    assert "SystemExit" in message
+    result = prediction._detect(LoadedDetector("leaver", "1", leave), np.zeros((8, 8), np.uint8), None)
+    assert len(result.detections) == 0
+    assert "SystemExit" in result.problem
