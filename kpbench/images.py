@@ -69,7 +69,7 @@ class ImageSource:
     folder: str = ""
 
     def locate(self, name: str) -> tuple[str, int, float]:
-        """Return the file of an image, the number of its frame (-1 for none), and its time in the film, s (nan for none).
+        """Return the file of an image, the number of its frame (-1 for none), and its time in a film, s (nan for none).
 
         Examples
         --------
@@ -120,9 +120,7 @@ def open_images(source: str, exclude: Path | None = None) -> ImageSource:
         if not files:
             raise DataError(f"{path}: neither a dataset nor a folder with images ({', '.join(IMAGE_SUFFIXES)})")
         problems: dict[str, str] = {}
-        return ImageSource(
-            _read_folder(path, files, problems), len(files), problems=problems, names=files, folder=source
-        )
+        return ImageSource(read_files(path, files, problems), len(files), problems=problems, names=files, folder=source)
     if not path.exists():
         raise DataError(f"{path}: no such dataset, image, folder or video")
     if path.suffix.lower() in VIDEO_SUFFIXES:
@@ -148,7 +146,8 @@ def refuse_same_folder(source: str | Path, target: Path) -> None:
         raise DataError(f"{target}: holds the images themselves, which would be overwritten; name another place")
 
 
-def _read_folder(folder: Path, names: Sequence[str], problems: dict[str, str]) -> Iterator[tuple[str, UInt8 | None]]:
+def read_files(folder: Path, names: Sequence[str], problems: dict[str, str]) -> Iterator[tuple[str, UInt8 | None]]:
+    """Yield name and pixels of each file of a folder; see :class:`ImageSource`, whose ``problems`` are filled."""
     notes = Notes()
     for name in names:
         found = _read_image(folder / name, notes)
@@ -183,8 +182,7 @@ def _read_image(path: Path, notes: Notes | None) -> UInt8 | Film | str:
 
 
 def _source_of(film: Film, name: str) -> ImageSource:
-    frames = ((f"{number:08d}.png", frame) for number, frame in enumerate(film.frames))
-    return ImageSource(frames, film.length, film.fps, name)
+    return ImageSource(((f"{n:08d}.png", frame) for n, frame in enumerate(film.frames)), film.length, film.fps, name)
 
 
 @contextmanager

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
+if TYPE_CHECKING:
+    from kpbench.types import Predictions
+
 SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 """Detectors that look for the shipped designs only. With --patches, template looks for the given designs instead."""
 
 
 @click.command()
-@click.argument("source")
+@click.argument("sources", metavar="SOURCE...", nargs=-1, required=True)
 @click.option(
     "--detector",
     default="template",
@@ -23,10 +27,10 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 )
 @click.option(
     "--out",
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=click.Path(dir_okay=False, path_type=Path, allow_dash=True),
     default=Path("preds.json"),
     show_default=True,
-    help="Predictions file to write.",
+    help="Predictions file to write; - writes JSON lines to stdout, each as soon as its image is done.",
 )
 @click.option(
     "--threshold",
@@ -41,7 +45,7 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 @PATCHES
 @WORKERS
 def detect(
-    source: str,
+    sources: tuple[str, ...],
     detector: str,
     out: Path,
     threshold: float | None,
@@ -49,10 +53,13 @@ def detect(
     patches: tuple[Path, ...],
     workers: int | None,
 ) -> None:
-    """Run a detector over SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
+    """Run a detector over a SOURCE: a dataset, an image, a folder of images, a video, or camera:0.
 
-    The command writes a predictions file (.json, .jsonl, .csv, .parquet, .h5) for `kpbench score`. The images of a
-    folder and the frames of a video are numbered from 0, in order.
+    Several SOURCEs are images and folders of images. A quoted pattern such as "photos/**/*.png" stands for all files
+    that it fits.
+
+    The command writes a predictions file (.json, .jsonl, .csv, .parquet, .h5) for `kpbench score`. Images and the
+    frames of a video are numbered from 0, in order.
 
     \b
     Examples:
@@ -60,6 +67,7 @@ def detect(
       kpbench detect photos --detector my_module:MyDetector --overlay drawn
       kpbench detect photos --detector template --patches my-patch.toml
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
+      kpbench detect camera:0 --detector superpoint-small --out -
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.detectors.interface import load_detector
@@ -71,21 +79,32 @@ def detect(
 
     if patches and detector != "template":
         raise click.UsageError(f"--patches is for the template detector; {detector} does not take designs")
-    require_predictions_path(out)
-    images = open_source(source, overlay)
+    is_streamed = str(out) == "-"
+    if not is_streamed:
+        require_predictions_path(out)
+    images = open_source(*sources, overlay=overlay)
     if detector in SHIPPED_DESIGNS_ONLY and not patches and has_other_designs(images):
         print_warning(
-            f"{source} holds other designs than {detector} looks for; use template with `patches`, "
+            f"{sources[0]} holds other designs than {detector} looks for; use template with `patches`, "
             "or weights trained on the other designs"
         )
     loaded = load_detector(detector, threshold, load_patches(patches)) if patches else detector
     try:
         with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
-            run = predict(images, loaded, threshold=threshold, workers=workers, overlay=overlay, progress=progress)
+            options: dict[str, Any] = {
+                "threshold": threshold,
+                "workers": workers,
+                "overlay": overlay,
+                "progress": progress,
+            }
+            run = predict(images, loaded, sink=_print_lines if is_streamed else None, **options)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"{out} is not written; the same command starts anew") from None
-    write_predictions(out, run.predictions)
-    echo(f"{out}: {len(run.predictions.xy)} detections in {len(run.predictions)} images")
+        text = () if is_streamed else (f"{out} is not written; the same command starts anew",)
+        raise KeyboardInterrupt(*text) from None
+    if not is_streamed:
+        write_predictions(out, run.predictions)
+    name = "stdout" if is_streamed else out
+    echo(f"{name}: {len(run.predictions.xy)} detections in {len(run.predictions)} images", err=is_streamed)
     if run.failures:
         pairs = [f"{label}: {problem}" for label, problem in run.failures]
         lines = images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs
@@ -93,3 +112,11 @@ def detect(
             print_warning(line)
         print_warning(f"{len(run.failures)} images failed and count as images without detections")
         raise SystemExit(1)
+
+
+def _print_lines(predictions: Predictions) -> None:
+    """Print predictions as JSON lines; those of no image as the header."""
+    from kpbench.predictions.json_files import encode_lines
+
+    for line in encode_lines(predictions, with_header=not len(predictions)):
+        click.echo(line)

@@ -6,6 +6,7 @@ import contextlib
 import math
 import time
 import traceback
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -62,6 +63,10 @@ class ImageResult(NamedTuple):
     """Time that the detector took, milliseconds; nan for an image that failed."""
 
 
+Sink = Callable[[Predictions], None]
+"""A function of the predictions of some images."""
+
+
 def predict(
     source: Dataset | ImageSource,
     detector: str | LoadedDetector,
@@ -70,6 +75,7 @@ def predict(
     workers: int | None = 1,
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
+    sink: Sink | None = None,
 ) -> PredictionRun:
     """Run a detector over a dataset, or over images without truth (see :func:`predict_images`).
 
@@ -89,6 +95,9 @@ def predict(
         Folder or video file to draw the detections into.
     progress : callable
         Called with the number of images finished since the last call.
+    sink : callable, optional
+        Called with the predictions of some images as soon as they are finished, in any order; first with those of no
+        image, which tell the detector and the dataset.
 
     Returns
     -------
@@ -107,7 +116,7 @@ def predict(
     (6, ())
     """
     if isinstance(source, ImageSource):
-        return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress)
+        return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress, sink=sink)
     dataset = source
     warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
@@ -119,13 +128,15 @@ def predict(
     found: dict[int, ImageResult] = {}
     ids = dataset.truth.image_id
     names = [f"{image_id:08d}.png" for image_id in ids]
+    pass_on = _pass_on(sink, loaded, dataset)
     with image_writer(overlay, count, names=names) as draw:
         for results in run_jobs(work, pieces, workers, progress):
             found.update(results)
+            pass_on([*results.values()], [], ids[[*results]])
         for n in range(count) if overlay is not None else ():
             draw(names[n], draw_detections(dataset.image(n), found[n].detections))
     labels = [f"image_id {image_id}" for image_id in ids]
-    return _collect(loaded, [found[n] for n in range(count)], labels, ids, dataset)
+    return _finish(loaded, [found[n] for n in range(count)], labels, ids, dataset)
 
 
 def predict_images(
@@ -135,6 +146,7 @@ def predict_images(
     threshold: float | None = None,
     overlay: Path | None = None,
     progress: Progress = lambda images: None,
+    sink: Sink | None = None,
 ) -> PredictionRun:
     """Run a detector over images that have no truth.
 
@@ -145,7 +157,7 @@ def predict_images(
     source : ImageSource
         From :func:`kpbench.images.open_images`. Ctrl-C ends a source of unknown length, such as a camera, and keeps the
         detections so far.
-    detector, threshold, overlay, progress
+    detector, threshold, overlay, progress, sink
         As for :func:`predict`.
 
     Returns
@@ -169,6 +181,7 @@ def predict_images(
     warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
     found, labels, inverted = list[ImageResult](), list[str](), InvertedPrints(loaded)
+    pass_on = _pass_on(sink, loaded, source)
     ends_by = () if source.length is not None else (KeyboardInterrupt,)
     with image_writer(overlay, source.length, source.fps, source.names) as draw, contextlib.suppress(*ends_by):
         for label, image in source.images:
@@ -176,15 +189,16 @@ def predict_images(
                 result = ImageResult(Detections.none(), source.problems.get(label, UNDECODABLE))
             else:
                 result = _detect(loaded, image, threshold)
-                inverted.look(label, image, result[0])
+                inverted.look(label, image, result.detections)
             found.append(result)
             labels.append(label)
+            pass_on([result], [label], np.array([len(found) - 1]))
             draw(label, None if image is None else draw_detections(image, result.detections))
             progress(1)
-    return _collect(loaded, found, labels, np.arange(len(found)), source)
+    return _finish(loaded, found, labels, np.arange(len(found)), source)
 
 
-def _collect(
+def _finish(
     detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
 ) -> PredictionRun:
     failures = tuple((label, r.problem) for label, r in zip(labels, found, strict=True) if r.problem)
@@ -194,6 +208,25 @@ def _collect(
         else:
             first = f"{source.path}, {labels[0]}: {found[0].problem}"
         raise DataError(f"detector {detector.name}: failed on all {len(found)} images, first {first}")
+    return PredictionRun(_collect(detector, found, labels, ids, source), failures)
+
+
+def _pass_on(
+    sink: Sink | None, detector: LoadedDetector, source: Dataset | ImageSource
+) -> Callable[[list[ImageResult], list[str], Int], None]:
+    """Return a function that gives the predictions of some images to ``sink``, and give it those of no image."""
+
+    def pass_on(found: list[ImageResult], labels: list[str], ids: Int) -> None:
+        if sink is not None:
+            sink(_collect(detector, found, labels, ids, source))
+
+    pass_on([], [], np.zeros(0, np.int64))
+    return pass_on
+
+
+def _collect(
+    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
+) -> Predictions:
     about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
     of_dataset: dict[str, Any] = {"size": [r.size for r in found], "ms": [r.ms for r in found]}
     if isinstance(source, Dataset):
@@ -202,8 +235,7 @@ def _collect(
     elif found:
         located = zip(*map(source.locate, labels), strict=True)
         of_dataset |= dict(zip(("file", "frame_index", "time_s"), located, strict=True))
-    predictions = Predictions.from_detections([r.detections for r in found], ids, about, **of_dataset)
-    return PredictionRun(predictions, failures)
+    return Predictions.from_detections([r.detections for r in found], ids, about, **of_dataset)
 
 
 def _detect(detector: LoadedDetector, image: UInt8, threshold: float | None) -> ImageResult:

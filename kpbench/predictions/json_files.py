@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable, Iterator
 from itertools import chain, pairwise
 from operator import attrgetter
@@ -207,6 +208,13 @@ def encode_images(predictions: Predictions) -> Iterator[bytes]:
         for name, rows in given:
             record[name] = rows[a:b].tolist()
         yield encode(record)
+
+
+def encode_lines(predictions: Predictions, with_header: bool) -> Iterator[str]:
+    """Yield the lines of a ``.jsonl`` file in ASCII, without their ends: the header if asked, then a line per image."""
+    lines = [msgspec.json.encode(make_header(predictions))] if with_header else []
+    for line in chain(lines, encode_images(predictions)):
+        yield json.dumps(json.loads(line), separators=(",", ":"))
 
 
 def encode_json(predictions: Predictions) -> bytes:

@@ -1,3 +1,4 @@
+import json
 import os
 import re
 import sys
@@ -100,6 +101,76 @@ def test_each_image_has_its_file_size_and_time(folder, plug):
     kpbench("detect", "set", "--detector", f"{plug}:brightest", "--out", "set.json")
     of_set = read_predictions("set.json")
     assert (of_set.file, of_set.size.tolist(), len(of_set.ms)) == (None, [[96, 80]] * 2, 2)
+
+
+@pytest.mark.parametrize("source", ["photos", "set"])
+def test_lines_are_streamed_to_stdout(folder, plug, source):
+    photos(folder)
+    generate(SynthConfig(3, size_px=(96, 96)), "set", workers=1)
+    found = kpbench("detect", source, "--detector", f"{plug}:brightest", "--out", "-")
+    assert not (folder / "-").exists()
+    assert "stdout: 6 detections in 3 images" in found.stderr
+    header, *lines = found.stdout.splitlines()
+    assert json.loads(header)["detector"]["name"] == f"{plug}:brightest"
+    assert [json.loads(line)["image_id"] for line in lines] == [0, 1, 2]
+    (folder / "p.jsonl").write_text(found.stdout)
+    kpbench("detect", source, "--detector", f"{plug}:brightest", "--out", "q.jsonl")
+    p, q = read_predictions("p.jsonl"), read_predictions("q.jsonl")
+    assert (p.detector, p.dataset, p.fingerprint, p.file) == (q.detector, q.dataset, q.fingerprint, q.file)
+    assert (p.xy.tolist(), p.patch_id.tolist(), p.size.tolist()) == (
+        q.xy.tolist(),
+        q.patch_id.tolist(),
+        q.size.tolist(),
+    )
+
+
+def test_a_line_comes_before_the_next_image_is_read():
+    def images():
+        yield "0.png", np.zeros((8, 8), np.uint8)
+        assert [len(p) for p in seen] == [0, 1]
+        yield "1.png", np.zeros((8, 8), np.uint8)
+
+    seen = []
+    detector = LoadedDetector("none", "1", lambda image: Detections.none())
+    run = predict_images(ImageSource(images(), None), detector, sink=seen.append)
+    assert [p.image_id.tolist() for p in seen] == [[], [0], [1]]
+    assert len(run.predictions) == 2
+
+
+def test_several_sources_and_patterns(folder, plug):
+    photos(folder)
+    (folder / "more").mkdir()
+    (folder / "photos" / "0.png").rename(folder / "more" / "9.png")
+    args = ("--detector", f"{plug}:brightest", "--threshold", 0.5)
+    kpbench("detect", "more/9.png", "photos", "photos/sub/1.png", *args, "--overlay", "drawn")
+    p = read_predictions("preds.json")
+    assert p.file == ("more/9.png", "photos/sub/1.png", "photos/sub/2.png")
+    assert p.xy.tolist() == [[20, 10], [20, 11], [20, 12]]
+    drawn = [path.relative_to("drawn").as_posix() for path in sorted(Path("drawn").rglob("*.png"))]
+    assert drawn == ["more/9.png", "photos/sub/1.png", "photos/sub/2.png"]
+    kpbench("detect", "photos/**/*.png", *args)
+    assert read_predictions("preds.json").file == ("photos/sub/1.png", "photos/sub/2.png")
+    kpbench("detect", "photos/sub/../sub/1.png", folder / "more", *args, "--overlay", "again")
+    assert read_predictions("preds.json").file == (f"{folder}/photos/sub/1.png", f"{folder}/more/9.png")
+    assert sorted(path.name for path in Path("again").rglob("*.png")) == ["1.png", "9.png"]
+
+
+@pytest.mark.parametrize(
+    ("sources", "says"),
+    [
+        (["*.tif"], "*.tif: the pattern fits no file"),
+        (["photos", "film.mp4"], "film.mp4: expected an image or a folder of images, as one of 2 sources"),
+        (["photos", "camera:0"], "camera:0: expected an image or a folder"),
+        (["photos", "set"], "set: expected an image or a folder"),
+        (["photos", "none.png"], "none.png: expected an image or a folder"),
+    ],
+)
+def test_a_source_that_cannot_be_one_of_several_is_named(folder, plug, sources, says):
+    photos(folder)
+    generate(SynthConfig(1, size_px=(96, 96)), "set", workers=1)
+    result = kpbench("detect", *sources, "--detector", f"{plug}:brightest", code=1)
+    assert says in result.stderr
+    assert not Path("preds.json").exists()
 
 
 def test_a_folder_in_order_of_names_and_a_threshold(folder, plug):
