@@ -45,11 +45,27 @@ def predictions(ids: bool = True, images: int = 5) -> kpbench.Predictions:
     return kpbench.Predictions.from_detections(found, image_id, about, "kpbench-data", "0" * 64)
 
 
+def full_predictions() -> kpbench.Predictions:
+    """Predictions with every optional column."""
+    rows, images = 7, 5
+    return replace(
+        predictions(),
+        A_patch2image=np.tile([[10.0, 1.5], [-1.5, 9.0]], (rows, 1, 1)),
+        covariance=np.tile([[0.01, 0.002], [0.002, 0.02]], (rows, 1, 1)),
+        blur_px=np.linspace(0, 2, rows),
+        file=tuple(f"folder/{n}.png" for n in range(images)),
+        size=np.tile([640, 480], (images, 1)),
+        frame_index=np.arange(images),
+        time_s=np.arange(images) / 25,
+        ms=np.linspace(1, 9, images),
+    )
+
+
 def predictions_files(suffix: str) -> list[bytes]:
     with folder() as where:
         path = where / f"p{suffix}"
         files = []
-        for content in (predictions(), predictions(ids=False), predictions(images=12)):
+        for content in (predictions(), predictions(ids=False), predictions(images=12), full_predictions()):
             kpbench.write_predictions(path, content)
             files.append(path.read_bytes())
     return files
