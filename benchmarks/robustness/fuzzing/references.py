@@ -21,6 +21,8 @@ import numpy as np
 
 MEASURED_MM = (99.0, 101.0)
 """Lengths of the rulers with which sidecars are corrected."""
+OF_IMAGE = ("image_id", "file", "width", "height", "frame_index", "time_s", "ms")
+"""Columns of predictions that say nothing of a detection."""
 Rows = dict[int, list[tuple[float, float, float, int | None]]]
 """Detections of each image: x, y, score, id."""
 
@@ -164,7 +166,7 @@ def predictions_parquet(data: bytes, found: Any) -> str:
     rows: Rows = {}
     for row in table.to_pylist():
         image = rows.setdefault(whole(row["image_id"]), [])
-        values = [None if isinstance(v, float) and math.isnan(v) else v for k, v in row.items() if k != "image_id"]
+        values = [None if isinstance(v, float) and math.isnan(v) else v for k, v in row.items() if k not in OF_IMAGE]
         if any(value is not None for value in values):
             score = number(row["score"]) if "score" in row else 1.0
             image.append((number(row["x"]), number(row["y"]), score, whole(row["id"]) if "id" in row else None))
