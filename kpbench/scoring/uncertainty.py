@@ -40,16 +40,16 @@ class MatchedErrors(NamedTuple):
     """Of shape (M, 2), px along the patch's own u and v; nan if the truth has no homography, as in COCO files."""
     along_tilt: Float
     """Of shape (M,), px towards the side of the patch that is farther away; nan for a patch without perspective."""
-    nees: Float
-    """Of shape (M,); inf if the covariance has no inverse, nan without covariance."""
-    sigma_px: Float
+    nees: Float | None
+    """Of shape (M,); inf if the covariance has no inverse. None without covariances."""
+    sigma_px: Float | None
     """Predicted standard deviation of a coordinate, the root of half the trace of the covariance, of shape (M,)."""
     scene: Int
     """Scene ID of the image, of shape (M,)."""
 
     def select(self, rows: Int) -> MatchedErrors:
         """Return some rows."""
-        return MatchedErrors(*(column[rows] for column in self))  # type: ignore[arg-type]
+        return MatchedErrors(*(None if c is None else c[rows] for c in self))  # type: ignore[arg-type]
 
     def rank(self, distance: Float) -> Int:
         """Return the order by distance (M,), and by all other values at equal distance.
@@ -58,7 +58,8 @@ class MatchedErrors(NamedTuple):
         """
         order = np.argsort(distance)
         if np.any(np.diff(distance[order]) == 0):
-            order = np.lexsort((self.sigma_px, self.nees, self.along_tilt, *self.in_patch.T, distance))
+            of_covariance = () if self.nees is None or self.sigma_px is None else (self.sigma_px, self.nees)
+            order = np.lexsort((*of_covariance, self.along_tilt, *self.in_patch.T, distance))
         return order
 
 
@@ -73,9 +74,8 @@ def measure_errors(outcomes: Outcomes, row: Int) -> MatchedErrors:
     """
     detection = outcomes.matches.detection[row]
     error = outcomes.detections.xy[detection] - outcomes.truth_points.xy[row]
-    nees, sigma_px = np.full(len(row), np.nan), np.full(len(row), np.nan)
-    if outcomes.detections.covariance is not None:
-        nees, sigma_px = _normalise(error, outcomes.detections.covariance[detection])
+    covariance = outcomes.detections.covariance
+    nees, sigma_px = (None, None) if covariance is None else _normalise(error, covariance[detection])
     in_patch, along_tilt = _turn(error, outcomes.truth.keypoints["H_patch2image"][row])
     scene = outcomes.truth.scene_id[outcomes.truth_points.image[row]]
     return MatchedErrors(in_patch, along_tilt, nees, sigma_px, scene)
@@ -126,7 +126,7 @@ def compute_uncertainty_metrics(errors: MatchedErrors) -> dict[str, float | None
         found["scatter_px"] = np.sqrt(np.mean((u - mean_u) ** 2 + (v - mean_v) ** 2))
     if len(tilt):
         found["bias_tilt_px"] = np.mean(tilt)
-    if len(errors.nees) and not np.isnan(errors.nees[0]):
+    if errors.nees is not None and errors.sigma_px is not None and len(errors.nees):
         found["sigma_median_px"] = np.median(errors.sigma_px)
         found["nees"] = np.mean(errors.nees) if np.isfinite(errors.nees).all() else None
     return {name: None if value is None else float(value) for name, value in found.items()}
@@ -138,7 +138,7 @@ UNCERTAINTY_METRICS = ("bias_px", "bias_u_px", "bias_v_px", "bias_tilt_px", "sca
 
 def estimate_nees_interval(errors: MatchedErrors, resamples: int, seed: int) -> Interval | None:
     """Return the 95 % interval of the mean NEES, from a bootstrap over the scenes with matched keypoints."""
-    if not len(errors.nees) or not np.isfinite(errors.nees).all():
+    if errors.nees is None or not len(errors.nees) or not np.isfinite(errors.nees).all():
         return None
     order = np.lexsort((errors.nees, errors.scene))
     first = np.flatnonzero(np.append(True, np.diff(errors.scene[order]) != 0))
@@ -163,19 +163,20 @@ def compute_nees_by_sigma(outcomes: Outcomes) -> list[dict[str, Any]]:
     """
     row = np.flatnonzero(outcomes.matched)
     errors = measure_errors(outcomes, row)
-    if not len(row) or np.isnan(errors.nees[0]):
+    if not len(row) or errors.sigma_px is None:
         return []
-    errors = errors.select(errors.rank(outcomes.matches.distance[row]))
-    sigma = errors.sigma_px
+    order = errors.rank(outcomes.matches.distance[row])
+    sigma, errors = errors.sigma_px[order], errors.select(order)
     edges = np.quantile(sigma, np.arange(1, BINS) / BINS, method="inverted_cdf")
     bin_of = np.searchsorted(edges, sigma)
     settings, bins = outcomes.settings, []
     for n in np.unique(bin_of):
-        part = errors.select(np.flatnonzero(bin_of == n))
+        inside = np.flatnonzero(bin_of == n)
+        part = errors.select(inside)
         bins.append(
             {
-                "sigma_px": [float(part.sigma_px.min()), float(part.sigma_px.max())],
-                "matched": len(part.sigma_px),
+                "sigma_px": [float(sigma[inside].min()), float(sigma[inside].max())],
+                "matched": len(inside),
                 "nees": compute_uncertainty_metrics(part)["nees"],
                 "interval": estimate_nees_interval(part, settings.resamples, settings.seed),
             }
