@@ -12,6 +12,8 @@ SYNTH_CAMERA = 5
 SUITE_BACKGROUND, SUITE_SCENE, SUITE_EFFECT, SUITE_FIELD = range(16, 20)
 """Stages in the making of a base scene of a suite. SUITE_SCENE draws pose, inks and light. SUITE_FIELD draws the random
 fields of the effects noise and low light."""
+SUITE_CAMERA, SUITE_SENSOR = 20, 21
+"""The same: what a camera draws for a base scene, and the noise of its sensor."""
 
 
 def stream(seed: int, index: int, stage: int) -> np.random.Generator:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,11 +26,17 @@ QUANTITIES: dict[str, dict[str, tuple[float, float, float]]] = {
         "defocus_px": (0.0, 35.0, 0.0),
         "corner_loss": (0.0, 1.0, 0.0),
         "k1": (-0.5, 0.5, 0.0),
+        "red_px": (-20.0, 20.0, 0.0),
+        "blue_px": (-20.0, 20.0, 0.0),
     },
     "scene": {
         "motion_px": (0.0, 100.0, 0.0),
+        "turn_deg": (0.0, 45.0, 0.0),
         "row_time": (0.0, 1.0, 0.0),
         "ink_gain": (-0.1, 0.1, 0.0),
+        "bow": (-0.2, 0.2, 0.0),
+        "twist": (-0.2, 0.2, 0.0),
+        "detail": (0, 20, 0),
     },
     "sensor": {
         "full_well_e": (10.0, 1e6, 10_000.0),
@@ -50,7 +57,9 @@ QUANTITIES: dict[str, dict[str, tuple[float, float, float]]] = {
     },
 }
 """Least value, greatest value and default of each quantity of each table of a camera's file."""
-WHOLE = ("bits", "jpeg_quality")
+WHOLE = ("bits", "jpeg_quality", "detail")
+MOST_SHIFT_PER_ROW = 0.5
+"""Largest product of the speed of a patch (px per exposure) and the row time (exposures per row)."""
 GAIN_STEP = 2.0**-10
 """Drawn ink gains are multiples of this, in disc radii, so that images share cached outlines."""
 
@@ -85,6 +94,31 @@ class CameraPreset:
     has_bayer_pattern: bool
     camera_seed: int = 0
 
+    def __post_init__(self) -> None:
+        most = {name: max(map(abs, span)) for name, span in self.spans}
+        if most["motion_px"] * most["row_time"] > MOST_SHIFT_PER_ROW:
+            raise DataError(
+                f"camera {self.name!r}: motion_px {most['motion_px']:g} times row_time {most['row_time']:g} is over "
+                f"{MOST_SHIFT_PER_ROW:g}, expected a shutter that is faster than the patches"
+            )
+        if most["bow"] and most["twist"]:
+            raise DataError(f"camera {self.name!r} has both bow and twist, expected one of them")
+
+    def with_values(self, values: Mapping[str, float | str | bool]) -> CameraPreset:
+        """Return the same camera with fixed values of some quantities, ``tone`` and ``bayer`` included.
+
+        Examples
+        --------
+        >>> from kpbench.camera import load_camera_preset
+        >>> preset = load_camera_preset("webcam").with_values({"bits": 8, "tone": "linear"})
+        >>> dict(preset.spans)["bits"], preset.tones
+        ((8, 8), ('linear',))
+        """
+        spans = tuple((key, (float(values[key]),) * 2 if key in values else span) for key, span in self.spans)
+        tones = (str(values["tone"]),) if "tone" in values else self.tones
+        bayer = bool(values.get("bayer", self.has_bayer_pattern))
+        return replace(self, spans=spans, tones=tones, has_bayer_pattern=bayer)
+
     def draw(self, rng: np.random.Generator) -> dict[str, Any]:
         """Draw the values of one image.
 
@@ -113,6 +147,11 @@ class CameraPreset:
         length = drawn.pop("motion_px")
         drawn["velocity_px"] = [round(length * c, 4), round(length * s, 4)]
         drawn["ink_gain"] = round(drawn["ink_gain"] / GAIN_STEP) * GAIN_STEP
+        z, (c, s) = float(rng.uniform(-1, 1)), (float(v) for v in cos_sin(2 * np.pi * float(rng.random())))
+        across, turn = float(np.sqrt(1 - z * z)), drawn["turn_deg"]
+        drawn["turn_deg"] = [round(turn * v, 4) for v in (across * c, across * s, z)]
+        drawn["axis_deg"] = round(180 * float(rng.random()), 2)
+        drawn["detail_seed"] = int(rng.integers(2**31))
         error = drawn.pop("balance_error")
         drawn["balance"] = [round(1 + error * float(rng.uniform(-1, 1)), 4) for _ in ("red", "blue")]
         curve = self._draw_tone(rng, drawn.pop("tone_parameter"))
@@ -172,24 +211,25 @@ def load_camera_preset(name: str) -> CameraPreset:
     path = find_shipped("cameras", name, "camera")
     content = read_toml(path, DataError)
     with name_source(path, DataError):
-        return _parse_preset(TomlTable(content, ("schema", "name", "seed", *QUANTITIES), DataError))
+        table = TomlTable(content, ("schema", "name", "seed", *QUANTITIES), DataError)
+        table.require_schema(CAMERA_SCHEMA)
+        return parse_preset(table, table.name(), table.whole_number("seed", 0, 2**31) if "seed" in table else 0)
 
 
-def _parse_preset(table: TomlTable) -> CameraPreset:
-    table.require_schema(CAMERA_SCHEMA)
+def parse_preset(table: TomlTable, name: str, camera_seed: int = 0) -> CameraPreset:
+    """Read the tables of :data:`QUANTITIES` from a table, and make a camera of them."""
     spans: list[tuple[str, tuple[float, float]]] = []
     tones: tuple[str, ...] = ("srgb",)
     has_bayer_pattern = False
     for part, quantities in QUANTITIES.items():
         more = {"sensor": ("bayer",), "processing": ("tone",)}.get(part, ())
         entries = table.table(part, (*quantities, *more), {})
-        for name, (low, high, default) in quantities.items():
-            spans.append((name, entries.span(name, low, high) if name in entries else (default, default)))
+        for key, (low, high, default) in quantities.items():
+            spans.append((key, entries.span(key, low, high) if key in entries else (default, default)))
         if "bayer" in entries and part == "sensor":
             has_bayer_pattern = entries.flag("bayer")
         if "tone" in entries and part == "processing":
             tones = tuple(map(str, entries.entries("tone", "a list of tone curves")))
             if unknown := [tone for tone in tones if tone not in TONES]:
-                raise DataError(f"processing.tone names {unknown[0]!r}, expected some of: {', '.join(TONES)}")
-    seed = table.whole_number("seed", 0, 2**31) if "seed" in table else 0
-    return CameraPreset(table.name(), tuple(spans), tones, has_bayer_pattern, seed)
+                raise DataError(f"{entries.path('tone')} names {unknown[0]!r}, expected some of: {', '.join(TONES)}")
+    return CameraPreset(name, tuple(spans), tones, has_bayer_pattern, camera_seed)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kpbench.camera.paper import Bow
+from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import Box, bounding_box, rasterise_edges
 from kpbench.geometry.homography import project
@@ -102,7 +103,7 @@ class Shutter:
 
         Raises
         ------
-        ValueError
+        DataError
             If the rows of some points are not found, because the image moves as fast as the shutter.
         """
         instant = np.broadcast_to(np.asarray(instants, np.float64), (len(points),))
@@ -120,7 +121,7 @@ class Shutter:
             slope = np.divide(error - error0, y - y0, out=np.full(len(y), -1.0), where=moves & (y != y0))
             step = np.where(moves, -error / np.minimum(slope, STEEPEST_SLOPE), 0.0)  # settled points rest
             y0, error0, y = np.where(moves, y, y0), np.where(moves, error, error0), y + step
-        raise ValueError(f"{moves.sum()} points move along the image's columns as fast as the rolling shutter")
+        raise DataError(f"{moves.sum()} points move along the image's columns as fast as the rolling shutter")
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,11 @@ FINITE = Finite()
 BACKGROUNDS = click.option(
     "--backgrounds", type=click.Path(path_type=Path), help="Folder of photographs. Default: procedural backgrounds."
 )
+CAMERA = click.option(
+    "--camera",
+    help="Camera that takes the images: industrial, webcam, phone, action-cam, or a .toml file of your own. Light is "
+    "blurred before the tone curve, as in a real camera.",
+)
 ONLY = click.option(
     "--only", type=Names(), default="", help="Only these conditions, such as scale,blur. Default: all conditions."
 )

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, run_options
+from kpbench.cli.options import BACKGROUNDS, CAMERA, ONLY, SEED, SIZE, run_options
 
 
 class Distortion(click.ParamType[tuple[float, ...]]):
@@ -45,6 +45,7 @@ class Distortion(click.ParamType[tuple[float, ...]]):
 @click.option(
     "--distortion", type=Distortion(), help="OpenCV's coefficients of lens distortion. Default: no distortion."
 )
+@CAMERA
 @click.option(
     "--board", type=click.Choice(["aruco", "apriltag", "charuco"]), help="Show a board of tags instead of the patches."
 )
@@ -58,22 +59,28 @@ def suite(
     size: tuple[int, int] | None,
     only: tuple[str, ...],
     distortion: tuple[float, ...] | None,
+    camera: str | None,
     board: str | None,
     **run: Any,
 ) -> None:
     """Write the images of a benchmark suite into a dataset folder.
 
-    NAME is paper-v1, extended-v1, or a .toml file of your own.
+    NAME is paper-v1, extended-v1, camera-v1, or a .toml file of your own.
 
     \b
     Examples:
       kpbench suite paper-v1 --images 20 --size 640x480
       kpbench suite paper-v1 --only scale,blur --backgrounds photos/ --out scale-and-blur
       kpbench suite paper-v1 --board aruco
+      kpbench suite paper-v1 --camera webcam
     """
+    from kpbench.camera.preset import load_camera_preset
     from kpbench.cli.synth import write_dataset
     from kpbench.synth.suite import SuiteConfig
     from kpbench.synth.suite_file import load_suite
 
-    config = SuiteConfig(load_suite(name), images, seed, size, only, backgrounds, distortion or (), board)
+    preset = None if camera is None else load_camera_preset(camera)
+    config = SuiteConfig(
+        load_suite(name), images, seed, size, only, backgrounds, distortion or (), board, preset=preset
+    )
     write_dataset(config, out or Path("kpbench-suite") / config.name, "suite", **run)

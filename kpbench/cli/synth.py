@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from kpbench.cli.messages import echo, print_warning
-from kpbench.cli.options import BACKGROUNDS, PATCHES, SEED, SIZE, Two, run_options
+from kpbench.cli.options import BACKGROUNDS, CAMERA, PATCHES, SEED, SIZE, Two, run_options
 
 if TYPE_CHECKING:
     from kpbench.dataset.config import DatasetConfig
@@ -36,11 +36,7 @@ if TYPE_CHECKING:
     help="Effects on images. paper: as in the paper, the default without --camera. none: the default with --camera. "
     "ladder: one or two effects of kpbench degrade, mild to severe.",
 )
-@click.option(
-    "--camera",
-    help="Camera that takes the images: industrial, webcam, phone, action-cam, or a .toml file of your own. Light is "
-    "blurred before the tone curve, as in a real camera.",
-)
+@CAMERA
 @click.option(
     "--radius-px",
     type=Two(float, "LEAST:MOST", ":", "5:80"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -42,7 +43,7 @@ class Camera:
     width_px, height_px : int
         Size of the image.
     focal_px : float
-        Focal length in px.
+        Focal length in px along x.
     distortion : tuple of float
         OpenCV's coefficients, see :class:`kpbench.geometry.lens.Lens`. For the model ``brown``, 0, 4, 5, 8 or 12
         numbers; all are zero for a camera without distortion. For the model ``fisheye``, 4 numbers.
@@ -50,6 +51,8 @@ class Camera:
         Model of the lens.
     principal_px : (float, float), optional
         The principal point, px. None: the centre of the image.
+    focal_y_px : float, optional
+        Focal length in px along y. None: the same as along x.
 
     Examples
     --------
@@ -66,12 +69,18 @@ class Camera:
     distortion: tuple[float, ...] = NO_DISTORTION
     model: LensModel = "brown"
     principal_px: tuple[float, float] | None = None
+    focal_y_px: float | None = None
 
     @property
     def K(self) -> Float:
         """Intrinsic matrix from the camera frame to px, ndarray of shape (3, 3)."""
         cx, cy = self.principal_px or ((self.width_px - 1) / 2, (self.height_px - 1) / 2)
-        return np.array([[self.focal_px, 0, cx], [0, self.focal_px, cy], [0, 0, 1]])
+        return np.array([[self.focal_px, 0, cx], [0, self.focal_y_px or self.focal_px, cy], [0, 0, 1]])
+
+    @cached_property
+    def _focal(self) -> Any:
+        """The focal length, or the focal lengths along x and y as ndarray of shape (2,)."""
+        return self.focal_px if self.focal_y_px is None else np.array([self.focal_px, self.focal_y_px])
 
     @cached_property
     def lens(self) -> Lens:
@@ -87,6 +96,13 @@ class Camera:
         """Return the same camera with a lens that keeps straight lines straight."""
         return replace(self, distortion=NO_DISTORTION, model="brown")
 
+    def scaled(self, scale: float) -> Camera:
+        """Return the same camera with an image of the same size that is magnified about the image's centre."""
+        middle = np.array([(self.width_px - 1) / 2, (self.height_px - 1) / 2])
+        x, y = (middle + scale * (self.K[:2, 2] - middle)).tolist()
+        focal_y = None if self.focal_y_px is None else scale * self.focal_y_px
+        return replace(self, focal_px=scale * self.focal_px, focal_y_px=focal_y, principal_px=(x, y))
+
     def project(self, points_camera: ArrayLike) -> Float:
         """Return the image points (N, 2), px, of points (N, 3) in the camera frame. Every z must be positive."""
         points = np.asarray(points_camera, np.float64)
@@ -94,7 +110,7 @@ class Camera:
 
     def distort(self, rays: Float) -> Float:
         """Return the image points (N, 2), px, of rays (x, y), shape (N, 2)."""
-        return np.asarray(self.focal_px * self.lens.distort(rays) + self.K[:2, 2])
+        return np.asarray(self._focal * self.lens.distort(rays) + self.K[:2, 2])
 
     def undistort(self, points_px: ArrayLike) -> Float:
         """Return the rays (x, y), shape (N, 2), of image points (N, 2), px. The inverse of :meth:`distort`.
@@ -104,7 +120,7 @@ class Camera:
         ValueError
             If a point lies outside the valid region of the lens, see :meth:`kpbench.geometry.lens.Lens.undistort`.
         """
-        return self.lens.undistort((np.asarray(points_px, np.float64) - self.K[:2, 2]) / self.focal_px)
+        return self.lens.undistort((np.asarray(points_px, np.float64) - self.K[:2, 2]) / self._focal)
 
     def local_K(self, ray: ArrayLike) -> Float:
         """Return the matrix, shape (3, 3), that equals :meth:`distort` to first order near one ray.
@@ -113,5 +129,5 @@ class Camera:
         """
         x, y = np.asarray(ray, np.float64)
         rays = np.array([[x, y]])
-        J, point = self.focal_px * self.lens.jacobian(rays)[0], self.distort(rays)[0]
+        J, point = self.K[[0, 1], [0, 1], None] * self.lens.jacobian(rays)[0], self.distort(rays)[0]
         return np.vstack([np.column_stack([J, point - (J[:, 0] * x + J[:, 1] * y)]), [0.0, 0.0, 1.0]])

@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
 
 from kpbench.errors import DesignError
 from kpbench.geometry.homography import project
-from kpbench.geometry.outline import cos_sin_deg
+from kpbench.geometry.outline import cos_sin_deg, flatten
+from kpbench.geometry.spread import spread
 from kpbench.patches.design import Patch, unit_polygons
 from kpbench.types import Float
 
@@ -23,6 +25,7 @@ from kpbench.types import Float
 # of 100 px, so the diameter is 0.16 of the side.
 HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
+SINGLE_DIAMETER = 0.92  # diameter of the one patch of a board, as a fraction of the side
 TOUCHING_MM = 1e-6  # a smaller overlap is accepted: after rounding, two touching patches may seem to overlap
 
 
@@ -77,7 +80,7 @@ class BoardLike(Protocol):
         """Keypoints, in the order of the ground truth."""
         ...
 
-    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+    def outlines(self, radius_px: Float, ink_gain: float = 0.0) -> tuple[list[list[Float]], list[list[Float]]]:
         """See :meth:`Board.outlines`."""
         ...
 
@@ -192,7 +195,7 @@ class Board:
         """Centres of the keypoints in mm of the board frame, ndarray of shape (N, 3) with z = 0."""
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
 
-    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+    def outlines(self, radius_px: Float, ink_gain: float = 0.0) -> tuple[list[list[Float]], list[list[Float]]]:
         """Return the outlines of all black ink, and of the whole patches, as polygons in mm of the board frame.
 
         Parameters
@@ -200,6 +203,8 @@ class Board:
         radius_px : ndarray of shape (n,)
             Radius of each keypoint's disc in the image, px. The radii set the number of corners: in the image, the
             polygons deviate from the exact curves by at most 1/1000 px.
+        ink_gain : float
+            Distance by which all edges of the black ink move outwards, in disc radii.
 
         Returns
         -------
@@ -211,7 +216,10 @@ class Board:
         parts, discs = [], []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
             # the tolerance is rounded down to a power of two, so that similar radii share an entry of the cache
-            black, disc = unit_polygons(k.patch, float(np.ldexp(0.5, np.frexp(1e-3 / radius)[1])))
+            tolerance = float(np.ldexp(0.5, np.frexp(1e-3 / radius)[1]))
+            black, disc = unit_polygons(k.patch, tolerance)
+            if ink_gain:
+                black = _spread_polygons(k.patch, tolerance, ink_gain)
             parts.append([project(k.H_patch2board, polygon) for polygon in black])
             discs.append([project(k.H_patch2board, polygon) for polygon in disc])
         return parts, discs
@@ -227,6 +235,32 @@ class Board:
         patches = [(k.patch.patch_id, k.patch.digest) for k in self.keypoints]
         content = ([[round(v, 6) + 0.0 for v in row] for row in lengths], patches)
         return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+@lru_cache(maxsize=64)
+def _spread_polygons(patch: Patch, tolerance: float, ink_gain: float) -> tuple[Float, ...]:
+    """Return the polygons of the black ink after ink gain, in the patch frame. Lengths are in disc radii."""
+    return tuple(flatten(spread(patch.black_region, ink_gain), tolerance))
+
+
+def single_board(patch: Patch, side_mm: float) -> Board:
+    """Return a board with one patch, which is almost as large as the board.
+
+    Parameters
+    ----------
+    patch : Patch
+    side_mm : float
+        Side of the square. The disc has 0.92 of this side as its diameter, or less if the patch has a rim.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.patches.board import single_board
+    >>> single_board(kpbench.shipped_patches()[0], side_mm=100.0).keypoints[0].diameter_mm
+    92.0
+    """
+    diameter_mm = SINGLE_DIAMETER * side_mm / patch.extent
+    return Board(f"single-{patch.name}", side_mm, side_mm, (BoardKeypoint(patch, 0.0, 0.0, 0.0, diameter_mm),))
 
 
 def hexagon_board(patch: Patch, side_mm: float) -> Board:

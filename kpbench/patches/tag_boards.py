@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.geometry.outline import circle, flatten
+from kpbench.geometry.outline import Line, Region, circle, flatten
+from kpbench.geometry.spread import spread
 from kpbench.patches.board import HEXAGON_DIAMETER
 from kpbench.types import Float
 
@@ -92,11 +93,16 @@ class TagBoard:
     keypoints: tuple[TagCorner, ...]
     black: NDArray[np.bool_] = field(compare=False, repr=False)
 
-    def outlines(self, radius_px: Float) -> tuple[list[list[Float]], list[list[Float]]]:
+    def outlines(self, radius_px: Float, ink_gain: float = 0.0) -> tuple[list[list[Float]], list[list[Float]]]:
         """Return the outlines as :meth:`kpbench.patches.Board.outlines` does. The only ink is that of black modules."""
         corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
         middle, module_mm = len(self.black) / 2, self.side_x_mm / len(self.black)
         ink = [module_mm * (corners + place - middle) for place in np.argwhere(self.black)[:, ::-1]]
+        if ink_gain:
+            gain = ink_gain * self.keypoints[0].diameter_mm / 2 / module_mm
+            tolerance = 1e-3 * self.keypoints[0].diameter_mm / 2 / float(radius_px.max()) / module_mm
+            modules = tuple(map(tuple, self.black.tolist()))
+            ink = [module_mm * (polygon - middle) for polygon in flatten(_spread_modules(modules, gain), tolerance)]
         discs = []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
             mm = k.diameter_mm / 2
@@ -111,6 +117,31 @@ class TagBoard:
             "modules": ["".join(" #"[int(black)] for black in row) for row in self.black],
             "keypoints": [[k.patch_id, k.x_mm, k.y_mm, k.diameter_mm] for k in self.keypoints],
         }
+
+
+@lru_cache(maxsize=16)
+def _spread_modules(black: tuple[tuple[bool, ...], ...], gain: float) -> Region:
+    """Return the outline of black modules whose edges all move outwards by ``gain``; lengths are in modules."""
+    edges: dict[tuple[int, int], list[tuple[int, int]]] = {}  # end points of the edges, by their start points
+
+    def add(start: tuple[int, int], end: tuple[int, int]) -> None:
+        if start in edges.get(end, []):  # two black neighbours share this edge
+            edges[end].remove(start)
+        else:
+            edges.setdefault(start, []).append(end)
+
+    for y, x in np.argwhere(np.array(black)).tolist():
+        corners = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
+        for n in range(4):
+            add(corners[n], corners[(n + 1) % 4])
+    contours = []
+    while start := next((point for point, ends in edges.items() if ends), None):
+        points = [start]
+        while (end := edges[points[-1]].pop()) != start:
+            points.append(end)
+        ends = [*points[1:], start]
+        contours.append(tuple(Line(*map(float, (*a, *b))) for a, b in zip(points, ends, strict=True)))
+    return spread(tuple(contours), gain)
 
 
 def tag_dictionary(board: str) -> cv2.aruco.Dictionary:

@@ -5,6 +5,7 @@ from .board_projection import pose_board as pose_board
 from .board_view import Appearance as Appearance
 from .board_view import board_keypoints as board_keypoints
 from .board_view import render_board as render_board
+from .detail import paint_detail as paint_detail
 from .lookalikes import draw_lookalikes as draw_lookalikes
 from .placement import Limits as Limits
 from .placement import Placement as Placement

@@ -94,6 +94,7 @@ def pose_board(
     yaw_deg: float = 0.0,
     roll_deg: float = 0.0,
     shift: tuple[float, float] = (0.0, 0.0),
+    inside_mm: Float | None = None,
 ) -> Pose:
     """Place a board at a given tilt, at the distance where the board covers a given share of the image.
 
@@ -115,6 +116,8 @@ def pose_board(
         Offset of the board's centre from the image's centre, in image widths and heights, before lens distortion. If
         the board would not fit into the image, the largest of 0.8, 0.6, 0.4, 0.2 and 0 times the shift is used at
         which the board fits.
+    inside_mm : ndarray of shape (n, 2), optional
+        Outline on the board, mm, that must lie in the image. None: the outline of the board.
 
     Returns
     -------
@@ -143,7 +146,7 @@ def pose_board(
     for fraction in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
         ray = np.append(fraction * np.asarray(shift) * size / camera.focal_px, 1.0)
         pose = Pose(R, _find_depth(camera, board, R, ray, area_percent / 100 * size.prod()) * ray)
-        outline = project_outline(camera, pose, board)
+        outline = project_outline(camera, pose, board) if inside_mm is None else project_polygon(camera, pose, inside_mm)
         if (outline >= margin_px - 0.5).all() and (outline <= size - 0.5 - margin_px).all():
             return pose
     view = f"{area_percent:g} % of the image at pitch {pitch_deg:g} and yaw {yaw_deg:g} degrees"

@@ -21,7 +21,7 @@ from kpbench.patches.board import BoardLike
 from kpbench.portable import cos_sin, matmul
 from kpbench.render.board_projection import Pose, polygon_area, project_outline, project_polygon, project_to_image
 from kpbench.render.scene import Mask, Rendering, measure_contrast
-from kpbench.types import KEYPOINT_DTYPE, Float, UInt8
+from kpbench.types import KEYPOINT_DTYPE, Float, Float32, UInt8
 
 EDGE_WIDTH = 0.008
 """Width of the band along the board's cut edge, as a fraction of the board's shorter side."""
@@ -104,7 +104,7 @@ def board_keypoints(camera: Camera, pose: Pose, board: BoardLike) -> NDArray[Any
         H = matmul(camera.local_K(ray), M_patch2camera)
         H /= H[2, 2]
         x, y = camera.distort(ray[None])[0]
-        ellipse = _ellipse_of_moments(_project_rim(camera, M_patch2camera)) if camera.is_bent else project_disc(H)
+        ellipse = ellipse_of_moments(_project_rim(camera, M_patch2camera)) if camera.is_bent else project_disc(H)
         axes = (ellipse.major, ellipse.minor, ellipse.angle_deg)
         keypoints[n] = (x, y, k.patch_id, *axes, H, 1.0, np.nan)
     return keypoints
@@ -117,7 +117,7 @@ def _project_rim(camera: Camera, M_patch2camera: Float) -> Float:
     return camera.project(matmul(rim, M_patch2camera.T))
 
 
-def _ellipse_of_moments(points: Float) -> Ellipse:
+def ellipse_of_moments(points: Float) -> Ellipse:
     """Return the ellipse with the same centroid and the same central second moments as a polygon.
 
     Green's theorem gives the moments of the polygon from its vertices.
@@ -178,10 +178,11 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike
 
     image, side_px = background.copy(), float(np.sqrt(polygon_area(outline)))
     if appearance.shadow:
-        _cast_shadow(image, outline, side_px, appearance)
+        in_image, light = shadow_light(image, outline, side_px, appearance)
+        image[in_image] = np.rint(image[in_image] * light).astype(np.uint8)
     black, white = appearance.black, appearance.white
     level = white * (appearance.edge * (board_cover - face_cover) + face_cover) - (white - black) * black_cover
-    level *= _brightness(appearance, box, project_to_image(camera, pose, np.zeros((1, 2)))[0], side_px)
+    level *= brightness(appearance, box, project_to_image(camera, pose, np.zeros((1, 2)))[0], side_px)
     in_image, in_box = clip_to_image(box, image)
     level, uncovered = level[in_box], 1.0 - board_cover[in_box]
     if background.ndim == 3:
@@ -196,7 +197,7 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike
 def _cover(
     outline: Float, face: Float, inks: list[list[Float]], discs: list[list[Float]]
 ) -> tuple[Box, Float, Float, Float, tuple[Mask, ...]]:
-    """Compute which fraction of each pixel a board, its face and its black ink cover.
+    """Compute which fraction of each pixel a board, its face and its black ink cover, see :func:`combine_covers`.
 
     Parameters
     ----------
@@ -204,26 +205,42 @@ def _cover(
         Outline of the whole board, and outline of its face: the board without the band along the cut edge. px.
     inks, discs : list of lists of ndarray of shape (n, 2)
         Polygons of each black area, and polygons of each patch, px.
+    """
+    ink_boxes, disc_boxes = [bounding_box(ink) for ink in inks], [bounding_box(disc) for disc in discs]
+    box = bounding_box([polygon for region in ([outline], *inks, *discs) for polygon in region])
+    boxes = [box, box, *ink_boxes, *disc_boxes]
+    covers = rasterise([[outline], [face], *inks, *discs], boxes)
+    return combine_covers(box, list(zip(boxes, covers, strict=True)), len(inks))
+
+
+def combine_covers(
+    box: Box, covers: list[tuple[Box, Float]], ink_count: int
+) -> tuple[Box, Float, Float, Float, tuple[Mask, ...]]:
+    """Put together the covers of the parts of a board.
+
+    Parameters
+    ----------
+    box : Box
+        Rectangle of pixels that holds the whole board.
+    covers : list of (Box, ndarray of shape (height, width))
+        Boxes and covered fractions of: the board and its face (both of the box ``box``), each ink, each patch.
+    ink_count : int
+        Number of inks.
 
     Returns
     -------
     box : Box
-        Rectangle of pixels that holds the whole board.
     board, face, black : ndarray of shape (height, width)
         Fraction of each pixel of the box that the board, the face or black ink covers.
     masks : tuple of Mask
         One mask per patch.
     """
-    ink_boxes, disc_boxes = [bounding_box(ink) for ink in inks], [bounding_box(disc) for disc in discs]
-    box = bounding_box([polygon for region in ([outline], *inks, *discs) for polygon in region])
-    covers = rasterise([[outline], [face], *inks, *discs], [box, box, *ink_boxes, *disc_boxes])
-    board_cover, face_cover = covers[:2]
-    ink_covers, disc_covers = covers[2 : 2 + len(inks)], covers[2 + len(inks) :]
+    board_cover, face_cover = covers[0][1], covers[1][1]
     black_cover = np.zeros_like(face_cover)
-    for ink_box, cover in zip(ink_boxes, ink_covers, strict=True):
+    for ink_box, cover in covers[2 : 2 + ink_count]:
         black_cover[_slices_within(box, ink_box)] += cover
     masks = []
-    for disc_box, cover in zip(disc_boxes, disc_covers, strict=True):
+    for disc_box, cover in covers[2 + ink_count :]:
         slices = _slices_within(box, disc_box)
         masks.append(Mask(disc_box, black_cover[slices], cover * face_cover[slices]))
     return box, board_cover, face_cover, black_cover, tuple(masks)
@@ -235,7 +252,7 @@ def _slices_within(outer: Box, inner: Box) -> tuple[slice, slice]:
     return slice(y, y + inner[3]), slice(x, x + inner[2])
 
 
-def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: float) -> Float:
+def brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: float) -> Float:
     """Compute the brightness of every pixel of a box, ndarray of shape (height, width), 0 to 1."""
     x, y, w, h = box
     across = (np.arange(x, x + w) - centre_px[0]) * (appearance.slope[0] / side_px)
@@ -243,10 +260,13 @@ def _brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: flo
     return np.asarray(np.clip(appearance.light + across + down[:, None], 0.0, 1.0))
 
 
-def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Appearance) -> None:
-    """Darken the scene behind the board, in place.
+def shadow_light(
+    image: UInt8 | Float32, outline_px: Float, side_px: float, appearance: Appearance
+) -> tuple[tuple[slice, slice], Float32]:
+    """Return rows and columns of the board's shadow, and the fraction of the light that is left in every pixel of it.
 
-    The shadow is smooth. The shadow is therefore computed on a coarse grid, and enlarged.
+    The shadow is smooth. The shadow is therefore computed on a coarse grid, and enlarged. The fractions have a last
+    axis of length 1 if the image has colours.
     """
     step = max(1, round(side_px / SHADOW_GRID))  # px per pixel of the coarse grid
     blur = SHADOW_BLUR * side_px / step
@@ -260,4 +280,4 @@ def _cast_shadow(image: UInt8, outline_px: Float, side_px: float, appearance: Ap
     fine = cv2.resize(coarse, None, fx=step, fy=step, interpolation=cv2.INTER_LINEAR_EXACT)
     in_image, in_box = clip_to_image((box[0] * step, box[1] * step, fine.shape[1], fine.shape[0]), image)
     light = 1 - np.float32(appearance.shadow / 255) * fine[in_box]
-    image[in_image] = np.rint(image[in_image] * (light if image.ndim == 2 else light[..., None])).astype(np.uint8)
+    return in_image, light if image.ndim == 2 else light[..., None]

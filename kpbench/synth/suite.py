@@ -9,7 +9,7 @@ patches or rungs are therefore paired.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.camera.preset import CameraPreset
 from kpbench.dataset.shard import Sample
 from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
-from kpbench.patches.board import BoardLike, hexagon_board
+from kpbench.geometry.homography import project
+from kpbench.patches.board import BoardLike, hexagon_board, single_board
 from kpbench.patches.design import shipped_patches
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
+from kpbench.portable import cos_sin
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
-from kpbench.seeds import SUITE_BACKGROUND, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, stream
+from kpbench.seeds import SUITE_BACKGROUND, SUITE_CAMERA, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, SUITE_SENSOR, stream
+from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
 from kpbench.synth.finish import degrade_scene, discs_of
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float
@@ -54,6 +58,10 @@ class View:
         Records of the effects, see :func:`kpbench.degrade.draw_effect`.
     keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
         The truth before occlusion; ``contrast`` is nan.
+    camera : Camera
+        Lens and size of the image.
+    taken : dict or None
+        What the camera drew, see :meth:`kpbench.camera.CameraPreset.draw`. None without a preset.
 
     Examples
     --------
@@ -71,6 +79,8 @@ class View:
     appearance: Appearance
     effects: list[Effect]
     keypoints: NDArray[Any]
+    camera: Camera
+    taken: Effect | None = None
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,9 @@ class SuiteConfig:
         boards of patches.
     shard_size : int
         Images per shard; changes the files but no image.
+    preset : CameraPreset or None
+        A camera from :func:`kpbench.camera.load_camera_preset` that takes the images in linear light, in the place of
+        the suite's own. Conditions of the suite may set some of its quantities. None: the suite's own camera.
 
     Raises
     ------
@@ -123,6 +136,7 @@ class SuiteConfig:
     distortion: tuple[float, ...] = ()
     board: str | None = None
     shard_size: int = 100  # 200 MB of pixels at 1624x1240
+    preset: CameraPreset | None = None
 
     def __post_init__(self) -> None:
         width, height = self.camera.width_px, self.camera.height_px
@@ -138,6 +152,10 @@ class SuiteConfig:
             (
                 self.board in (None, *TAG_BOARDS),
                 f"`board` is {self.board}, expected one of: {', '.join(TAG_BOARDS)}",
+            ),
+            (
+                self.preset is None or not self.distortion,
+                "`preset` and `distortion` are both given, expected one of them",
             ),
         ):
             if not is_valid:
@@ -164,11 +182,26 @@ class SuiteConfig:
         return tuple((c, n) for c in chosen for n in range(len(c.rungs)))
 
     @cached_property
+    def presets(self) -> tuple[CameraPreset | None, ...]:
+        """The camera of every rung."""
+        preset = self.preset or self.suite.preset
+        if preset is None:
+            return (None,) * len(self.rungs)
+        return tuple(preset.with_values({key: levels[n] for key, levels in c.camera}) for c, n in self.rungs)
+
+    @cached_property
     def boards(self) -> tuple[BoardLike, ...]:
-        """The boards. Every base scene is shown with each board under every rung."""
+        """The boards. Every base scene is shown with each board under every rung, or with boards of a single patch."""
         if self.board is not None:
             return (tag_board(self.board, BOARD_SIDE_MM),)
         return tuple(hexagon_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
+
+    @cached_property
+    def _single_boards(self) -> tuple[BoardLike, ...]:
+        """The boards of a single patch; boards of tags stay as they are."""
+        if self.board is not None:
+            return self.boards
+        return tuple(single_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
 
     @property
     def name(self) -> str:
@@ -191,8 +224,8 @@ class SuiteConfig:
         return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
 
     @cached_property
-    def _background_cache(self) -> dict[int, Background]:
-        """Backgrounds by base scene."""
+    def _background_cache(self) -> dict[tuple[int, int], Background]:
+        """Backgrounds by base scene and number of channels."""
         return {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -204,6 +237,7 @@ class SuiteConfig:
         The config holds no path, so that a moved background folder gives the same bytes.
         """
         camera, conditions = self.camera, {c.name: c for c, _ in self.rungs}.values()
+        preset = self.preset or self.suite.preset
         targets: dict[str, Any] = {"patches": [patch.to_dict() for patch in self.suite.patches]}
         if self.board is not None:
             targets = {"board": tag_board(self.board, BOARD_SIDE_MM).to_dict()}
@@ -220,6 +254,7 @@ class SuiteConfig:
             "backgrounds": describe_backgrounds(self.photos),
             "scene": {key: list(span) for key, span in self.suite.scene},
             "conditions": [_describe_condition(c) for c in conditions],
+            **({} if preset is None else {"preset": preset.to_dict()}),
             **targets,
         }
 
@@ -238,18 +273,22 @@ class SuiteConfig:
         scene_id = self.scene_id(index)
         rung, which_board = divmod(index // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
-        board = self.boards[which_board]
+        board = (self._single_boards if condition.board == "single" else self.boards)[which_board]
         rng = stream(self.seed, scene_id, SUITE_SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
+        preset = self.presets[rung]
+        taken = preset and preset.draw(stream(self.seed, scene_id, SUITE_CAMERA))
+        camera = replace(self.camera, distortion=(taken["k1"], 0.0, 0.0, 0.0)) if taken and taken["k1"] else self.camera
         pose = pose_board(
-            self.camera,
+            camera,
             board,
             drawn["area_percent"],
             pitch_deg=drawn["pitch_deg"],
             yaw_deg=drawn["yaw_deg"],
             roll_deg=drawn["roll_deg"],
             shift=(drawn["shift_x"], drawn["shift_y"]),
+            inside_mm=_disc_outline(board) if condition.board == "single" else None,
         )
         appearance = Appearance(
             drawn["black"],
@@ -259,11 +298,15 @@ class SuiteConfig:
             slope=(drawn["slope_x"], drawn["slope_y"]),
             shadow=drawn["shadow"],
         )
-        keypoints = board_keypoints(self.camera, pose, board)
+        if taken:
+            keypoints = expose_board(board, pose, camera, taken).keypoints(camera)
+        else:
+            keypoints = board_keypoints(camera, pose, board)
         rng, size_px = stream(self.seed, scene_id, SUITE_EFFECT), (self.camera.width_px, self.camera.height_px)
         discs = discs_of(keypoints)
         effects = [draw_effect(rng, name, levels[step], size_px, discs) for name, levels in condition.effects]
-        return View(condition.name, condition.rungs[step], scene_id, board, pose, appearance, effects, keypoints)
+        what = (condition.name, condition.rungs[step], scene_id)
+        return View(*what, board, pose, appearance, effects, keypoints, camera, taken)
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         """Make one image. The result is a function of the config, the index and the background files.
@@ -280,14 +323,20 @@ class SuiteConfig:
             Background files that were tried and could not be decoded.
         """
         view = self.view(index)
-        background = self._find_background(view.scene_id)
-        clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)
+        taken = view.taken
+        background = self._find_background(view.scene_id, 3 if taken and needs_colour(taken) else 1)
+        if taken:
+            exposed = expose_board(view.board, view.pose, view.camera, taken)
+            rng = stream(self.seed, view.scene_id, SUITE_SENSOR)
+            clean = photograph_board(background.image, view.camera, exposed, view.appearance, rng, taken)
+        else:
+            clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)
         scene = degrade_scene(clean, stream(self.seed, view.scene_id, SUITE_FIELD), view.effects)
         sample = Sample(
             index,
             scene.image,
             scene.keypoints,
-            view.effects,
+            [*([taken] if taken else []), *view.effects],
             background.file,
             condition=view.condition,
             rung=view.rung,
@@ -295,22 +344,23 @@ class SuiteConfig:
         )
         return sample, background.broken_files
 
-    def _find_background(self, scene_id: int) -> Background:
+    def _find_background(self, scene_id: int, channels: int) -> Background:
         """Return the background of a base scene from the cache, or make the background.
 
         A base scene is used again under every rung. The cache holds as many backgrounds as a shard has images.
         """
-        if scene_id in self._background_cache:
-            return self._background_cache[scene_id]
+        key = (scene_id, channels)
+        if key in self._background_cache:
+            return self._background_cache[key]
         rng = stream(self.seed, scene_id, SUITE_BACKGROUND)
         width, height = self.camera.width_px, self.camera.height_px
         if self.photos is None:
-            background = Background(procedural_background(rng, width, height))
+            background = Background(procedural_background(rng, width, height, channels))
         else:
-            background = self.photos.sample(rng, width, height, 1)
+            background = self.photos.sample(rng, width, height, channels)
         if len(self._background_cache) >= self.shard_size:
             del self._background_cache[next(iter(self._background_cache))]
-        self._background_cache[scene_id] = background
+        self._background_cache[key] = background
         return background
 
 
@@ -318,7 +368,16 @@ def _describe_condition(condition: Condition) -> dict[str, Any]:
     """Return a condition for the config; the effects are a list, because their order matters."""
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]
-    return {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
+    described = {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
+    if condition.camera:
+        described["camera"] = {key: list(values) for key, values in condition.camera}
+    return described | ({} if condition.board == "hexagon" else {"board": condition.board})
+
+
+def _disc_outline(board: BoardLike) -> Float:
+    """Return points on the rim of the disc of a board with one keypoint, ndarray of shape (64, 2), mm."""
+    angles = np.arange(64) * (2 * np.pi / 64)
+    return project(board.keypoints[0].H_patch2board, np.column_stack(cos_sin(angles)))
 
 
 def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
@@ -335,7 +394,8 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
         The board's keypoints with z = 0, in the order of the truth.
     camera : Camera
 
-    The function returns None, not a tuple, if the dataset was not made from a suite.
+    The function returns None, not a tuple, if the dataset was not made from a suite, or if its images differ in lens,
+    board or bow of the paper because a camera took them.
 
     Examples
     --------
@@ -345,7 +405,7 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
     >>> points_mm.shape, camera.width_px
     ((6, 3), 1624)
     """
-    if config.get("kind") != "suite":
+    if config.get("kind") != "suite" or "preset" in config:
         return None
     width, height = config["size_px"]
     k1, k2, p1, p2, k3 = config["distortion"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from kpbench.camera.preset import QUANTITIES, TONES, WHOLE, CameraPreset, parse_preset
 from kpbench.degrade.ladder import LADDER
 from kpbench.errors import DataError
 from kpbench.files import find_shipped, shipped_files
@@ -15,7 +16,9 @@ from kpbench.toml import TomlTable, name_source, read_toml
 
 SUITE_SCHEMA = "kpbench.suite/1"
 SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition")
-CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects")
+CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board")
+BOARDS = ("hexagon", "single")
+"""Boards of patches of a condition: :func:`kpbench.hexagon_board`, or one patch that is almost as large as the board."""
 SCENE_KEYS = {
     "area_percent": (0.01, 90.0),
     "pitch_deg": (-80.0, 80.0),
@@ -36,8 +39,12 @@ SCENE_KEYS = {
 :func:`kpbench.render.pose_board` explains the pose. :class:`kpbench.render.Appearance` explains the inks and the light.
 """
 
+CAMERA_BOUNDS = {key: bounds[:2] for table in QUANTITIES.values() for key, bounds in table.items()}
+"""Range of the values that a condition may set for each quantity of a camera."""
 Levels = tuple[tuple[str, tuple[float, ...]], ...]
 """Names of quantities or effects, each with one value per rung."""
+CameraLevels = tuple[tuple[str, tuple[float | str | bool, ...]], ...]
+"""Quantities of the camera, each with one value per rung."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,11 @@ class Condition:
         Quantities of the scene that the condition sets, each with one value per rung.
     effects : tuple of (str, tuple of float)
         Effects in the order in which they are applied, each with one level per rung.
+    camera : tuple of (str, tuple of float, str or bool)
+        Quantities of the camera that the condition sets, each with one value per rung: those of
+        :data:`kpbench.camera.preset.QUANTITIES`, ``tone`` and ``bayer``.
+    board : {"hexagon", "single"}
+        See :data:`BOARDS`.
 
     Examples
     --------
@@ -67,6 +79,8 @@ class Condition:
     rungs: tuple[float, ...]
     pose: Levels
     effects: Levels
+    camera: CameraLevels = ()
+    board: str = "hexagon"
 
 
 @dataclass(frozen=True)
@@ -88,6 +102,8 @@ class Suite:
     scene : tuple of (str, (float, float))
         Name, least value and greatest value of each quantity that is drawn for a scene, see :data:`SCENE_KEYS`.
     conditions : tuple of Condition
+    preset : CameraPreset or None
+        The camera that takes the images, in linear light. None: a linear world, in which inks keep their levels.
 
     Examples
     --------
@@ -105,6 +121,7 @@ class Suite:
     pixel_um: float
     scene: tuple[tuple[str, tuple[float, float]], ...]
     conditions: tuple[Condition, ...]
+    preset: CameraPreset | None = None
 
     def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
         """Return the camera of the suite, or a camera of another image size with the same horizontal field of view.
@@ -129,7 +146,7 @@ def shipped_suites() -> dict[str, Path]:
     --------
     >>> from kpbench.synth import shipped_suites
     >>> list(shipped_suites())
-    ['extended-v1', 'paper-v1']
+    ['camera-v1', 'extended-v1', 'paper-v1']
     """
     return shipped_files("suites")
 
@@ -162,13 +179,14 @@ def load_suite(name: str) -> Suite:
 
 def _parse_suite(table: TomlTable) -> Suite:
     table.require_schema(SUITE_SCHEMA)
-    camera = table.table("camera", ("size_px", "lens_mm", "pixel_um"))
+    camera = table.table("camera", ("size_px", "lens_mm", "pixel_um", *QUANTITIES))
     scene = table.table("scene", SCENE_KEYS)
     table.entries("condition", "a list of tables")
     conditions = tuple(_parse_condition(entry) for entry in table.tables("condition", CONDITION_KEYS))
     names = [c.name for c in conditions]
     if len(set(names)) < len(names):
         raise DataError(f"two conditions share a name, among: {', '.join(names)}")
+    has_preset = any(key in camera for key in QUANTITIES) or any(c.camera for c in conditions)
     width, height = camera.numbers("size_px", 64, 16384, 2, whole=True)
     return Suite(
         name=table.name(),
@@ -179,6 +197,7 @@ def _parse_suite(table: TomlTable) -> Suite:
         pixel_um=camera.number("pixel_um", 0.01, 1e3),
         scene=tuple((key, scene.span(key, *bounds)) for key, bounds in SCENE_KEYS.items()),
         conditions=conditions,
+        preset=parse_preset(camera, table.name()) if has_preset else None,
     )
 
 
@@ -187,10 +206,24 @@ def _parse_condition(table: TomlTable) -> Condition:
     rungs = table.numbers("rungs", -1e6, 1e6)
     pose = table.table("pose", SCENE_KEYS, {})
     effects = table.table("effects", LADDER, {})
+    camera = table.table("camera", (*CAMERA_BOUNDS, "tone", "bayer"), {})
     return Condition(
         name=table.name(),
         unit=table.text("unit"),
         rungs=rungs,
         pose=tuple((key, pose.numbers(key, *SCENE_KEYS[key], len(rungs))) for key in pose.values),
         effects=tuple((key, effects.numbers(key, *LADDER[key].bounds, len(rungs))) for key in effects.values),
+        camera=tuple((key, _parse_camera_levels(camera, key, len(rungs))) for key in camera.values),
+        board=table.choice("board", BOARDS, "hexagon"),
     )
+
+
+def _parse_camera_levels(camera: TomlTable, key: str, count: int) -> tuple[float | str | bool, ...]:
+    if key not in ("tone", "bayer"):
+        low, high = CAMERA_BOUNDS[key]
+        return camera.numbers(key, low, high, count, key in WHOLE)
+    expected = f"a list of {count} " + ("times true or false" if key == "bayer" else f"of: {', '.join(TONES)}")
+    values = camera.entries(key, expected)
+    if len(values) != count or not all(isinstance(v, bool) if key == "bayer" else v in TONES for v in values):
+        raise camera.problem(key, expected)
+    return tuple(values)

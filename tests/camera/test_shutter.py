@@ -6,6 +6,7 @@ import pytest
 
 from kpbench.camera.paper import Cylinder
 from kpbench.camera.shutter import BoardMotion, PatchMotion, Shutter, rasterise_moving, sub_exposures, true_homography
+from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera, rotation_xyz
 from kpbench.geometry.homography import project
 from kpbench.geometry.outline import circle, flatten
@@ -126,7 +127,7 @@ def test_instants_follow_the_path_and_chords_follow_bent_edges():
     assert sub_exposures(still, rim, Shutter()).tolist() == [0.0]
     ((_, disc),) = rasterise_moving([[rim]], moved)
     assert np.isclose(disc.sum(), np.pi * 400, rtol=1e-5)
-    with pytest.raises(ValueError, match="as fast as"):
+    with pytest.raises(DataError, match="as fast as"):
         Shutter(1.0).expose(PatchMotion((0.0, 1.0)).of_patch(H), rim)
 
 
