@@ -17,6 +17,8 @@ from .evaluate import ScoredFile as ScoredFile
 from .evaluate import compare_files as compare_files
 from .evaluate import score_file as score_file
 from .fitting.design_fit import fit as fit
+from .geometry.camera_file import read_camera as read_camera
+from .geometry.camera_file import write_camera as write_camera
 from .patches.board import Board as Board
 from .patches.board import grid_board as grid_board
 from .patches.board import hexagon_board as hexagon_board

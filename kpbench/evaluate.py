@@ -329,7 +329,7 @@ def _find_dataset(
 
 
 def _compute_poses(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
-    from kpbench.synth.suite import board_in_view  # imported here, because few runs need it and it loads OpenCV
+    from kpbench.synth.suite_boards import board_in_view  # imported here, because few runs need it and it loads OpenCV
 
     view = board_in_view(dataset.config)
     if view is None:

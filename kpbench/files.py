@@ -50,8 +50,14 @@ def find_shipped(kind: str, name: str, word: str) -> Path:
     """
     shipped = shipped_files(kind)
     if name not in shipped and Path(name).suffix != ".toml":
-        raise DataError(f"there is no {word} {name!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+        raise DataError(
+            f"there is no {word} {name!r}, only: {', '.join(shipped)}, or a {FILES_OF_ONES_OWN[kind]} file of your own"
+        )
     return shipped.get(name, Path(name))
+
+
+FILES_OF_ONES_OWN = {"suites": ".toml", "cameras": ".toml, .yaml or .json"}
+"""Which files of the user's may stand for a shipped name."""
 
 
 def shipped_files(kind: str) -> dict[str, Path]:

@@ -37,6 +37,7 @@ _TEXT_MARKS = [
         rb"---\n(?:[^\n]+\n){1,9}---\n\n<!-- MARK: kpbench replaces this file ",  # Markdown of a dataset's card
         rb"% MARK\n",  # LaTeX
         rb"# MARK\ntrain: images\n",  # YAML of an export
+        rb"(?:%YAML:1\.0\n---\n)?# MARK\n(?:image_width|cam0):",  # YAML of a calibration
         rb"999\nMARK\n",  # DXF
         rb"MARK (?:coco|yolo|webdataset) [0-9a-f]{64}\n",  # state of an export
     )

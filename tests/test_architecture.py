@@ -31,6 +31,7 @@ GROUND = {
     "filters": ["types", "portable"],
     "files": ["errors"],
     "text": [],
+    "yaml_text": [],
     "toml": ["errors", "files", "text"],
     "writing": ["errors", "files"],
     "locks": ["errors", "files"],

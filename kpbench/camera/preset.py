@@ -12,6 +12,8 @@ import numpy as np
 from kpbench.camera.tone import ToneCurve, random_tone_curve
 from kpbench.errors import DataError
 from kpbench.files import find_shipped, shipped_files
+from kpbench.geometry.camera import Camera
+from kpbench.geometry.camera_file import CALIBRATION_SUFFIXES, read_camera
 from kpbench.portable import cos_sin
 from kpbench.toml import TomlTable, name_source, read_toml
 
@@ -79,6 +81,8 @@ class CameraPreset:
         Whether the sensor of a colour image has colour filters.
     camera_seed : int
         Identity of the camera, which fixes the fixed pattern of the sensor.
+    calibration : Camera or None
+        Lens and image size from a calibration file. None: the lens has the quantity ``k1``, and any image size.
 
     Examples
     --------
@@ -93,6 +97,7 @@ class CameraPreset:
     tones: tuple[str, ...]
     has_bayer_pattern: bool
     camera_seed: int = 0
+    calibration: Camera | None = None
 
     def __post_init__(self) -> None:
         most = {name: max(map(abs, span)) for name, span in self.spans}
@@ -173,6 +178,7 @@ class CameraPreset:
             "tone": list(self.tones),
             "bayer": self.has_bayer_pattern,
             "camera_seed": self.camera_seed,
+            **({} if self.calibration is None else {"calibration": self.calibration.to_dict()}),
         }
 
 
@@ -194,7 +200,9 @@ def load_camera_preset(name: str) -> CameraPreset:
     Parameters
     ----------
     name : str
-        Name of a shipped camera, or path of a TOML file.
+        Name of a shipped camera, path of a TOML file, or path of a calibration file, see
+        :func:`kpbench.geometry.read_camera`. A calibration gives the lens and the size of the images. Of such a camera,
+        all else is ideal: a linear tone curve, little noise, no processing.
 
     Raises
     ------
@@ -208,6 +216,11 @@ def load_camera_preset(name: str) -> CameraPreset:
     >>> load_camera_preset("phone").tones
     ('s-curve', 'random')
     """
+    if Path(name).suffix.lower() in CALIBRATION_SUFFIXES:
+        spans = tuple(
+            (key, (default, default)) for table in QUANTITIES.values() for key, (_, _, default) in table.items()
+        )
+        return CameraPreset("calibration", spans, ("linear",), False, calibration=read_camera(name))
     path = find_shipped("cameras", name, "camera")
     content = read_toml(path, DataError)
     with name_source(path, DataError):

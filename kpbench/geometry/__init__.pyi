@@ -1,4 +1,6 @@
 from .camera import Camera as Camera
+from .camera_file import read_camera as read_camera
+from .camera_file import write_camera as write_camera
 from .coverage import bounding_box as bounding_box
 from .coverage import rasterise as rasterise
 from .homography import project as project

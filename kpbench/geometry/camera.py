@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kpbench.errors import DataError
 from kpbench.geometry.lens import Lens, LensModel
 from kpbench.portable import cos_sin, matmul
 from kpbench.types import Float
@@ -95,6 +96,48 @@ class Camera:
     def without_distortion(self) -> Camera:
         """Return the same camera with a lens that keeps straight lines straight."""
         return replace(self, distortion=NO_DISTORTION, model="brown")
+
+    def at_size(self, width_px: int, height_px: int) -> Camera:
+        """Return the same camera with images of another size: a whole-number multiple or fraction of its own.
+
+        Raises
+        ------
+        DataError
+            If the size is no whole-number multiple or fraction of the camera's.
+
+        Examples
+        --------
+        >>> from kpbench.geometry import Camera
+        >>> Camera(640, 480, 700.0).at_size(1280, 960).focal_px
+        1400.0
+        """
+        scale, own = width_px / self.width_px, f"{self.width_px}x{self.height_px}"
+        is_whole = float(scale).is_integer() or float(self.width_px / width_px).is_integer()
+        if not is_whole or height_px != self.height_px * scale:
+            raise DataError(
+                f"the image has {width_px}x{height_px} px, expected the camera's {own} or a whole-number scale of it"
+            )
+        if scale == 1:
+            return self
+        x, y = ((self.K[:2, 2] + 0.5) * scale - 0.5).tolist()
+        focal_y = None if self.focal_y_px is None else scale * self.focal_y_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            focal_px=scale * self.focal_px,
+            focal_y_px=focal_y,
+            principal_px=(x, y),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the camera for the config of a dataset."""
+        return {
+            "model": self.model,
+            "size_px": [self.width_px, self.height_px],
+            "K": self.K.tolist(),
+            "distortion": list(self.distortion),
+        }
 
     def scaled(self, scale: float) -> Camera:
         """Return the same camera with an image of the same size that is magnified about the image's centre."""

@@ -26,7 +26,7 @@ from kpbench.render.board_view import (
     EDGE_WIDTH,
     RIM_POINTS,
     Appearance,
-    brightness,
+    board_brightness,
     combine_covers,
     ellipse_of_moments,
     shadow_light,
@@ -38,6 +38,9 @@ OUTLINE_POINTS = 32
 """Number of points on each side of the board; the board's shadow and size are computed from these points."""
 BOARD_TOLERANCE_PX = 4e-3
 """Largest distance between a drawn edge and the true edge of a board, px."""
+
+
+STILL_BOARD, GLOBAL_SHUTTER = BoardMotion(), Shutter()
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,8 @@ class ExposedBoard:
 
     board: BoardLike
     pose: Pose
-    motion: BoardMotion = BoardMotion()
-    shutter: Shutter = Shutter()
+    motion: BoardMotion = STILL_BOARD
+    shutter: Shutter = GLOBAL_SHUTTER
     bow: Bow | None = None
     ink_gain: float = 0.0
 
@@ -136,11 +139,11 @@ def paint_board(light: Float32, camera: Camera, exposed: ExposedBoard, appearanc
     parts = combine_covers(box, [(box, _enlarge(*cover, box)) for cover in covers[:2]] + covers[2:], len(inks))
     _, board_cover, face_cover, black_cover, masks = parts
     if appearance.shadow:
-        in_image, left = shadow_light(light, outline_px, side_px, appearance)
-        light[in_image] *= left
+        in_image, fraction = shadow_light(light, outline_px, side_px, appearance)
+        light[in_image] *= fraction
     black, white = SCENE_TONE.light(np.array([appearance.black, appearance.white]) / 255).tolist()
     level = white * (appearance.edge * (board_cover - face_cover) + face_cover) - (white - black) * black_cover
-    level *= brightness(appearance, box, exposed.see(camera, np.zeros((1, 2)))[0], side_px)
+    level *= board_brightness(appearance, box, exposed.see(camera, np.zeros((1, 2)))[0], side_px)
     in_image, in_box = clip_to_image(box, light)
     level, uncovered = level[in_box], 1.0 - board_cover[in_box]
     if light.ndim == 3:

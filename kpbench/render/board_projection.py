@@ -146,7 +146,9 @@ def pose_board(
     for fraction in (1.0, 0.8, 0.6, 0.4, 0.2, 0.0):
         ray = np.append(fraction * np.asarray(shift) * size / camera.focal_px, 1.0)
         pose = Pose(R, _find_depth(camera, board, R, ray, area_percent / 100 * size.prod()) * ray)
-        outline = project_outline(camera, pose, board) if inside_mm is None else project_polygon(camera, pose, inside_mm)
+        outline = (
+            project_outline(camera, pose, board) if inside_mm is None else project_polygon(camera, pose, inside_mm)
+        )
         if (outline >= margin_px - 0.5).all() and (outline <= size - 0.5 - margin_px).all():
             return pose
     view = f"{area_percent:g} % of the image at pitch {pitch_deg:g} and yaw {yaw_deg:g} degrees"

@@ -182,7 +182,7 @@ def render_board(background: UInt8, camera: Camera, pose: Pose, board: BoardLike
         image[in_image] = np.rint(image[in_image] * light).astype(np.uint8)
     black, white = appearance.black, appearance.white
     level = white * (appearance.edge * (board_cover - face_cover) + face_cover) - (white - black) * black_cover
-    level *= brightness(appearance, box, project_to_image(camera, pose, np.zeros((1, 2)))[0], side_px)
+    level *= board_brightness(appearance, box, project_to_image(camera, pose, np.zeros((1, 2)))[0], side_px)
     in_image, in_box = clip_to_image(box, image)
     level, uncovered = level[in_box], 1.0 - board_cover[in_box]
     if background.ndim == 3:
@@ -252,7 +252,7 @@ def _slices_within(outer: Box, inner: Box) -> tuple[slice, slice]:
     return slice(y, y + inner[3]), slice(x, x + inner[2])
 
 
-def brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: float) -> Float:
+def board_brightness(appearance: Appearance, box: Box, centre_px: Float, side_px: float) -> Float:
     """Compute the brightness of every pixel of a box, ndarray of shape (height, width), 0 to 1."""
     x, y, w, h = box
     across = (np.arange(x, x + w) - centre_px[0]) * (appearance.slope[0] / side_px)

@@ -15,8 +15,10 @@ from kpbench.camera.paper import Bow, Cylinder, Saddle
 from kpbench.camera.shutter import BoardMotion, PatchMotion, Shutter
 from kpbench.degrade.effects import jpeg
 from kpbench.geometry.camera import Camera
+from kpbench.geometry.homography import project
 from kpbench.geometry.warp import PointMap
 from kpbench.patches.board import BoardLike
+from kpbench.portable import cos_sin
 from kpbench.render.board_exposure import ExposedBoard, paint_board
 from kpbench.render.board_projection import Pose
 from kpbench.render.board_view import Appearance
@@ -27,19 +29,22 @@ from kpbench.render.scene import Mask, Rendering, fraction_inside, keypoint_tabl
 from kpbench.types import Float32, UInt8
 
 
-def lens_warp(k1: float, width_px: int, height_px: int) -> PointMap | None:
-    """Return the map of image points that a lens with the coefficient k1 causes; None for no distortion.
+def scene_camera(record: dict[str, Any], width_px: int, height_px: int, calibration: Camera | None = None) -> Camera:
+    """Return the camera of a scene of single patches.
 
-    The focal length is the width of the image. The centre of the image stays.
+    Without a calibration, the lens has the coefficient k1 of the record, and the width of the image as focal length.
     """
-    if not k1:
-        return None
-    camera = Camera(width_px, height_px, float(width_px), (k1, 0.0, 0.0, 0.0))
-    return lambda points: camera.distort((points - camera.K[:2, 2]) / camera.focal_px)
+    if calibration is not None:
+        return calibration.at_size(width_px, height_px)
+    return Camera(width_px, height_px, float(width_px), (record["k1"], 0.0, 0.0, 0.0))
 
 
 def photograph_scene(
-    background: UInt8, placements: Sequence[Placement], rng: np.random.Generator, record: dict[str, Any]
+    background: UInt8,
+    placements: Sequence[Placement],
+    rng: np.random.Generator,
+    record: dict[str, Any],
+    calibration: Camera | None = None,
 ) -> Rendering:
     """Draw patches in linear light before a background, and take a picture of them.
 
@@ -53,17 +58,24 @@ def photograph_scene(
         Gives the noise of the sensor.
     record : dict
         From :meth:`kpbench.camera.CameraPreset.draw`.
+    calibration : Camera, optional
+        See :class:`kpbench.camera.CameraPreset`.
 
     Returns
     -------
     Rendering
         The truth is the pose at the middle of the exposure of the row on which the centre falls, behind the lens.
-        Patches whose centre leaves the image are not drawn.
+        Patches whose centre leaves the image are not drawn, nor those that reach out of the valid region of the lens.
     """
     height, width = background.shape[:2]
     motion = PatchMotion(velocity_px=tuple(record["velocity_px"]), turn_deg=record["turn_deg"][2])
     shutter = Shutter.rolling(record["row_time"], height) if record["row_time"] else None
-    warp = lens_warp(record["k1"], width, height)
+    camera = scene_camera(record, width, height, calibration)
+    focal_px, middle = np.diag(camera.K)[:2], camera.K[:2, 2]
+    warp: PointMap | None = None
+    if camera.is_bent:
+        warp = lambda points: camera.distort((points - middle) / focal_px)  # noqa: E731
+        placements = [p for p in placements if _is_valid(p, camera)]
     true = [true_placement(placement, motion, shutter, warp) for placement in placements]
     rows = [n for n, placement in enumerate(true) if _is_inside(placement, width, height)]
     drawn, true = [placements[n] for n in rows], [true[n] for n in rows]
@@ -194,6 +206,15 @@ def _paint_details(light: Float32, keypoints: NDArray[Any], white: Sequence[floa
     for n, H_patch2image in enumerate(keypoints["H_patch2image"] if record["detail"] else ()):
         rng = np.random.default_rng([record["detail_seed"], n])
         paint_detail(light, H_patch2image, rng, record["detail"], white=white[n])
+
+
+def _is_valid(placement: Placement, camera: Camera) -> bool:
+    """Return whether all of a patch lies in the valid region of the lens, before the lens bends it."""
+    angles = np.arange(16) * (2 * np.pi / 16)
+    extent = 1.1 * placement.patch.extent
+    rim = project(placement.H_patch2image, extent * np.column_stack(cos_sin(angles)))
+    rays = (rim - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+    return bool(np.sqrt((rays * rays).sum(axis=1)).max() < camera.lens.largest_radius)
 
 
 def _is_inside(placement: Placement, width_px: int, height_px: int) -> bool:

@@ -8,13 +8,11 @@ patches or rungs are therefore paired.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.camera.preset import CameraPreset
@@ -23,22 +21,16 @@ from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
-from kpbench.geometry.homography import project
-from kpbench.patches.board import BoardLike, hexagon_board, single_board
-from kpbench.patches.design import shipped_patches
+from kpbench.patches.board import BoardLike
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
-from kpbench.portable import cos_sin
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
 from kpbench.seeds import SUITE_BACKGROUND, SUITE_CAMERA, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, SUITE_SENSOR, stream
 from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
 from kpbench.synth.finish import degrade_scene, discs_of
+from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, suite_boards
 from kpbench.synth.suite_file import Condition, Suite
-from kpbench.types import Float
-
-BOARD_SIDE_MM = 187.5
-"""Side of every board, mm; a patch of a hexagon board of this size has a diameter of 30 mm."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +87,8 @@ class SuiteConfig:
     seed : int
         0 or more.
     size_px : (int, int) or None
-        Width and height; None for the suite's own size. The horizontal field of view does not depend on ``size_px``.
+        Width and height; None for the size of the calibration, if any, or the suite's own size. Without a calibration,
+        the horizontal field of view does not depend on ``size_px``.
     only : tuple of str
         Names of the conditions to make; an empty tuple makes all conditions.
     backgrounds : Path or None
@@ -173,6 +166,9 @@ class SuiteConfig:
     @cached_property
     def camera(self) -> Camera:
         """The camera at the configured size."""
+        if self.preset is not None and self.preset.calibration is not None:
+            calibration = self.preset.calibration
+            return calibration.at_size(*self.size_px) if self.size_px else calibration
         return self.suite.camera(self.size_px, self.distortion)
 
     @cached_property
@@ -192,16 +188,12 @@ class SuiteConfig:
     @cached_property
     def boards(self) -> tuple[BoardLike, ...]:
         """The boards. Every base scene is shown with each board under every rung, or with boards of a single patch."""
-        if self.board is not None:
-            return (tag_board(self.board, BOARD_SIDE_MM),)
-        return tuple(hexagon_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
+        return suite_boards(self.suite.patches, self.board)
 
     @cached_property
     def _single_boards(self) -> tuple[BoardLike, ...]:
         """The boards of a single patch; boards of tags stay as they are."""
-        if self.board is not None:
-            return self.boards
-        return tuple(single_board(patch, BOARD_SIDE_MM) for patch in self.suite.patches)
+        return suite_boards(self.suite.patches, self.board, "single")
 
     @property
     def name(self) -> str:
@@ -278,7 +270,7 @@ class SuiteConfig:
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
         preset = self.presets[rung]
-        taken = preset and preset.draw(stream(self.seed, scene_id, SUITE_CAMERA))
+        taken = None if preset is None else preset.draw(stream(self.seed, scene_id, SUITE_CAMERA))
         camera = replace(self.camera, distortion=(taken["k1"], 0.0, 0.0, 0.0)) if taken and taken["k1"] else self.camera
         pose = pose_board(
             camera,
@@ -288,7 +280,7 @@ class SuiteConfig:
             yaw_deg=drawn["yaw_deg"],
             roll_deg=drawn["roll_deg"],
             shift=(drawn["shift_x"], drawn["shift_y"]),
-            inside_mm=_disc_outline(board) if condition.board == "single" else None,
+            inside_mm=disc_outline(board) if condition.board == "single" else None,
         )
         appearance = Appearance(
             drawn["black"],
@@ -372,45 +364,3 @@ def _describe_condition(condition: Condition) -> dict[str, Any]:
     if condition.camera:
         described["camera"] = {key: list(values) for key, values in condition.camera}
     return described | ({} if condition.board == "hexagon" else {"board": condition.board})
-
-
-def _disc_outline(board: BoardLike) -> Float:
-    """Return points on the rim of the disc of a board with one keypoint, ndarray of shape (64, 2), mm."""
-    angles = np.arange(64) * (2 * np.pi / 64)
-    return project(board.keypoints[0].H_patch2board, np.column_stack(cos_sin(angles)))
-
-
-def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
-    """Return the keypoints of the board that the images of a suite show, and the camera of the images.
-
-    Parameters
-    ----------
-    config : mapping
-        The ``config`` of the dataset.
-
-    Returns
-    -------
-    points_mm : ndarray of shape (n, 3)
-        The board's keypoints with z = 0, in the order of the truth.
-    camera : Camera
-
-    The function returns None, not a tuple, if the dataset was not made from a suite, or if its images differ in lens,
-    board or bow of the paper because a camera took them.
-
-    Examples
-    --------
-    >>> from kpbench import SuiteConfig, load_suite
-    >>> from kpbench.synth import board_in_view
-    >>> points_mm, camera = board_in_view(SuiteConfig(load_suite("paper-v1")).to_dict())
-    >>> points_mm.shape, camera.width_px
-    ((6, 3), 1624)
-    """
-    if config.get("kind") != "suite" or "preset" in config:
-        return None
-    width, height = config["size_px"]
-    k1, k2, p1, p2, k3 = config["distortion"]
-    camera = Camera(width, height, config["focal_px"], (k1, k2, p1, p2, k3))
-    if "board" in config:
-        return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
-    # the keypoints of hexagon boards have the same positions, whatever the patch
-    return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera

@@ -18,7 +18,7 @@ SUITE_SCHEMA = "kpbench.suite/1"
 SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition")
 CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board")
 BOARDS = ("hexagon", "single")
-"""Boards of patches of a condition: :func:`kpbench.hexagon_board`, or one patch that is almost as large as the board."""
+"""Boards of patches of a condition: :func:`kpbench.hexagon_board`, or one patch almost as large as the board."""
 SCENE_KEYS = {
     "area_percent": (0.01, 90.0),
     "pitch_deg": (-80.0, 80.0),

@@ -138,6 +138,8 @@ class SynthConfig:
             if not is_valid:
                 raise DataError(problem)
         require_memory(SYNTH_BYTES_PER_PIXEL * self.size_px[0] * self.size_px[1], f"`size_px`: an image of {size}")
+        if self.camera is not None and self.camera.calibration is not None:
+            self.camera.calibration.at_size(*self.size_px)
         if self.augmentation is not None:
             try_pipeline(self.augmentation, self.size_px, self.channels)
 
@@ -203,7 +205,7 @@ class SynthConfig:
         else:
             rng = stream(self.seed, index, SYNTH_CAMERA)
             taken = [self.camera.draw(rng)]
-            scene = photograph_scene(background.image, placements, rng, taken[0])
+            scene = photograph_scene(background.image, placements, rng, taken[0], self.camera.calibration)
         rng = stream(self.seed, index, SYNTH_DETERIORATION)
         effects = self._draw_effects(rng, scene.keypoints)
         scene = degrade_scene(scene, rng, effects)

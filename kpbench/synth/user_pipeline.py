@@ -28,20 +28,17 @@ from kpbench.geometry.homography import project
 from kpbench.memory import limit_process
 from kpbench.render.placement import Placement
 from kpbench.types import UInt8
+from kpbench.yaml_text import parse_yaml
 
 LEAST_IMAGE_SHARE = 0.999
 """A homography is fitted only to pixels of which more than this fraction comes from the original image."""
 LEAST_DISC_PIXELS = 12
 """Fewest pixels of a disc to which a homography is fitted; a patch with fewer pixels counts as outside the image."""
 
-DEEPEST = 100
-"""Levels of a pipeline in YAML."""
 PIPELINE_BYTES, PIPELINE_BYTES_PER_PIXEL = 2**30, 100
 """Memory that a pipeline may take for an image, bytes: in all, and in addition per pixel of the image."""
 PIPELINE_SECONDS = 5
 """Processor time that a pipeline may take for two images of up to a megapixel, s; more for larger images."""
-LONGEST_SCALAR = 1000
-"""Characters of a value of a pipeline in YAML: a number of a hundred thousand digits takes seconds."""
 
 
 def _import_albumentations() -> Any:
@@ -85,28 +82,13 @@ def load_augmentation(path: str | Path) -> str:
     """
     text = read_text(path, DataError)
     try:
-        content = _parse_yaml(text) if Path(path).suffix.lower() in (".yaml", ".yml") else json.loads(text)
+        content = parse_yaml(text) if Path(path).suffix.lower() in (".yaml", ".yml") else json.loads(text)
         canonical = json.dumps(content, sort_keys=True)
         _build_pipeline(canonical)
     except Exception as error:  # a parser or a transform's own checks may raise anything
         problem = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise DataError(f"{path}: no pipeline as albumentations.save writes it ({problem})") from None
     return canonical
-
-
-def _parse_yaml(text: str) -> Any:
-    import yaml  # type: ignore[import-untyped]  # albumentations requires yaml
-
-    # A few lines of aliases of aliases stand for millions of values. albumentations.save writes no alias.
-    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # the loader in Python needs seconds for some small files
-    depth = 0
-    for event in yaml.parse(text, loader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent) or len(getattr(event, "value", "")) > LONGEST_SCALAR:
-            raise ValueError(f"it has an alias (*name), or a value of over {LONGEST_SCALAR} characters")
-        if depth > DEEPEST:
-            raise ValueError(f"it is nested more than {DEEPEST} levels deep")
-    return yaml.load(text, loader)
 
 
 @lru_cache(maxsize=4)

@@ -38,7 +38,9 @@ def test_neither_workers_nor_shards_change_a_byte(tmp_path):
 
 PLAIN = {
     "effect": "camera", "preset": "none", "camera_seed": 0, "wavelength_um": 0.55, "f_number": 2.8, "pixel_um": 6.0,
-    "defocus_px": 0.0, "corner_loss": 0.0, "k1": 0.0, "velocity_px": [0.0, 0.0], "row_time": 0.0, "ink_gain": 0.0,
+    "defocus_px": 0.0, "corner_loss": 0.0, "k1": 0.0, "red_px": 0.0, "blue_px": 0.0, "velocity_px": [0.0, 0.0],
+    "turn_deg": [0.0, 0.0, 0.0], "row_time": 0.0, "ink_gain": 0.0, "bow": 0.0, "twist": 0.0, "axis_deg": 30.0,
+    "detail": 0, "detail_seed": 0,
     "full_well_e": 1e6, "exposure": 1.0, "read_noise_e": 0.0, "prnu": 0.0, "dsnu_e": 0.0, "row_noise_e": 0.0,
     "bits": 12, "balance": [1.0, 1.0], "tone": {"name": "srgb", "parameters": []}, "denoise_sigma": 0.0,
     "sharpen_amount": 0.0, "sharpen_sigma_px": 1.0, "jpeg_quality": 0, "bayer": False,

@@ -1,0 +1,78 @@
+"""The boards that the images of a suite show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kpbench.geometry.camera import Camera
+from kpbench.geometry.homography import project
+from kpbench.patches.board import BoardLike, hexagon_board, single_board
+from kpbench.patches.design import Patch, shipped_patches
+from kpbench.patches.tag_boards import tag_board
+from kpbench.portable import cos_sin
+from kpbench.types import Float
+
+BOARD_SIDE_MM = 187.5
+"""Side of every board, mm; a patch of a hexagon board of this size has a diameter of 30 mm."""
+
+
+def suite_boards(patches: Sequence[Patch], tags: str | None, kind: str = "hexagon") -> tuple[BoardLike, ...]:
+    """Return the boards of a suite.
+
+    Parameters
+    ----------
+    patches : sequence of Patch
+    tags : str or None
+        Name of a board of tags, which replaces the boards of patches.
+    kind : {"hexagon", "single"}
+        Boards of six patches, or of a single patch.
+    """
+    if tags is not None:
+        return (tag_board(tags, BOARD_SIDE_MM),)
+    make = single_board if kind == "single" else hexagon_board
+    return tuple(make(patch, BOARD_SIDE_MM) for patch in patches)
+
+
+def disc_outline(board: BoardLike) -> Float:
+    """Return points on the rim of the disc of a board with one keypoint, ndarray of shape (64, 2), mm."""
+    angles = np.arange(64) * (2 * np.pi / 64)
+    return project(board.keypoints[0].H_patch2board, np.column_stack(cos_sin(angles)))
+
+
+def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
+    """Return the keypoints of the board that the images of a suite show, and the camera of the images.
+
+    Parameters
+    ----------
+    config : mapping
+        The ``config`` of the dataset.
+
+    Returns
+    -------
+    points_mm : ndarray of shape (n, 3)
+        The board's keypoints with z = 0, in the order of the truth.
+    camera : Camera
+
+    The function returns None, not a tuple, if the dataset was not made from a suite, or if its images differ in lens,
+    board or bow of the paper because a camera took them.
+
+    Examples
+    --------
+    >>> from kpbench import SuiteConfig, load_suite
+    >>> from kpbench.synth.suite_boards import board_in_view
+    >>> points_mm, camera = board_in_view(SuiteConfig(load_suite("paper-v1")).to_dict())
+    >>> points_mm.shape, camera.width_px
+    ((6, 3), 1624)
+    """
+    if config.get("kind") != "suite" or "preset" in config:
+        return None
+    width, height = config["size_px"]
+    k1, k2, p1, p2, k3 = config["distortion"]
+    camera = Camera(width, height, config["focal_px"], (k1, k2, p1, p2, k3))
+    if "board" in config:
+        return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
+    # the keypoints of hexagon boards have the same positions, whatever the patch
+    return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera
