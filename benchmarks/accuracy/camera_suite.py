@@ -4,10 +4,10 @@ The bias of a rung is computed per design from its matched detections: the mean 
 px of the mean radius. The square of the mean's own standard error is subtracted from its square. The bias of the rung
 is the root mean square over the designs, and the largest design.
 
-    python benchmarks/accuracy/camera_suite.py --backgrounds PHOTOS --images 8 --seed 1 --out FOLDER
-        [--suite camera-v1] [--only CONDITION,…] [--detector NAME]… [--size WxH] [--compare OTHER_SEED]
+    python benchmarks/accuracy/camera_suite.py --backgrounds PHOTOS --images 8 --seed 1 2 --out FOLDER
+        [--suite camera-v1] [--only CONDITION,…] [--detector NAME]… [--size WxH]
 
-A second seed shows whether the detectors rank alike. Finished work in the folder is kept.
+Two seeds show whether the detectors rank alike. Finished work in the folder is kept.
 """
 
 from __future__ import annotations

@@ -157,6 +157,7 @@ class SuiteConfig:
         for name in self.only:
             if name not in known:
                 raise DataError(f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
+        _ = self.presets  # raises an error if a rung's camera is impossible
 
     @property
     def scenes(self) -> int:
