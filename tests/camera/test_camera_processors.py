@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from kpbench import SuiteConfig, load_suite
 from kpbench.camera import (
     ToneCurve,
     blur_linear,
@@ -39,7 +40,11 @@ def digests():
     raw = expose(mosaic(light, (0.5, 1, 0.6)), rng, 900, prnu=0.01, dsnu_e=1, row_noise_e=0.5, black_dn=64)
     mosaics = [demosaic(raw, "bilinear"), demosaic(raw, "edge-aware")]
     images = [develop(colours, curves[0], 12, 64, (2, 1, 1.7)) for colours in mosaics]
+    only = ("tone", "bow", "saddle", "rolling-shutter", "moving-board", "bayer-denoise", "chromatic", "detail")
+    suite = SuiteConfig(load_suite("camera-v1"), images=1, seed=3, size_px=(203, 155), only=only)
+    samples = [suite.make(n)[0] for n in range(2, suite.n, 12)]
     results = {
+        "suite": [values for sample in samples for values in (sample.image, sample.keypoints)],
         "tone": [f(grey) for curve in curves for f in (curve.value, curve.light, curve.encode)],
         "psf": kernels,
         "blur": [blur_linear(light, kernel) for kernel in kernels],
