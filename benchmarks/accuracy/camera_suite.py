@@ -1,8 +1,8 @@
 """What detectors lose under a camera: detection score and bias of each rung of a suite. Simulated.
 
-The bias of a rung is computed per design from its matched detections: the mean error vector in the patch's frame, in
-px of the mean radius. The square of the mean's own standard error is subtracted from its square. The bias of the rung
-is the root mean square over the designs, and the largest design.
+The bias of an image is the length of the mean error vector of its matched keypoints in the patch's frame, px of the
+mean radius. All six patches of an image have the same design, turn and nearly the same pose. The square of the mean's
+own standard error is subtracted from its square. The bias of a rung is the root mean square over its images.
 
     python benchmarks/accuracy/camera_suite.py --backgrounds PHOTOS --images 8 --seed 1 2 --out FOLDER
         [--suite camera-v1] [--only CONDITION,…] [--detector NAME]… [--size WxH]
@@ -22,11 +22,11 @@ from kpbench.scoring.outcomes import Outcomes
 from kpbench.types import Float
 
 DETECTORS = ["superpoint-small", "superpoint", "template"]
-LEAST_MATCHES = 8
-"""A design with fewer matches in a rung has no bias."""
+LEAST_MATCHES = 4
+"""An image with fewer matches has no bias."""
 
 
-def biases(outcomes: Outcomes, keypoints: np.ndarray, rows: np.ndarray) -> dict[int, float]:
+def biases(outcomes: Outcomes, keypoints: np.ndarray, image: np.ndarray, rows: np.ndarray) -> dict[int, float]:
     """Bias of each design, px, over the matched keypoints among ``rows``."""
     rows = rows[outcomes.matched[rows]]
     found = outcomes.detections.xy[outcomes.matches.detection[rows]]
@@ -35,13 +35,14 @@ def biases(outcomes: Outcomes, keypoints: np.ndarray, rows: np.ndarray) -> dict[
     A = (H[:, :2, :2] - centre[:, :, None] * H[:, 2:, :2]) / H[:, 2:, 2:]
     radius = np.sqrt(np.abs(np.linalg.det(A)))
     error = np.linalg.solve(A, (found - centre)[:, :, None])[:, :, 0] * radius[:, None]
-    result = {}
-    for patch_id in np.unique(keypoints["patch_id"][rows]):
-        e: Float = error[keypoints["patch_id"][rows] == patch_id]
+    squares: dict[int, list[float]] = {}
+    for n in np.unique(image[rows]):
+        e: Float = error[image[rows] == n]
         if len(e) >= LEAST_MATCHES:
+            patch_id = int(keypoints["patch_id"][rows][image[rows] == n][0])
             square = (e.mean(axis=0) ** 2).sum() - e.var(axis=0, ddof=1).sum() / len(e)
-            result[int(patch_id)] = float(np.sqrt(max(square, 0.0)))
-    return result
+            squares.setdefault(patch_id, []).append(square)
+    return {patch_id: float(np.sqrt(max(np.mean(values), 0.0))) for patch_id, values in squares.items()}
 
 
 def table(run: kpbench.BenchRun) -> dict[tuple[str, float], tuple[float, float, float]]:
@@ -54,7 +55,7 @@ def table(run: kpbench.BenchRun) -> dict[tuple[str, float], tuple[float, float, 
     for condition, rungs in run.scores.conditions.items():
         for rung in rungs:
             rows = np.flatnonzero((truth.condition[image] == condition) & (truth.rung[image] == rung))
-            found = biases(outcomes, keypoints, rows)
+            found = biases(outcomes, keypoints, image, rows)
             values = np.array(list(found.values())) if found else np.array([np.nan])
             score = float(outcomes.matched[rows].mean())
             cells[condition, rung] = (score, float(np.sqrt((values**2).mean())), float(values.max()))
