@@ -11,6 +11,23 @@ def test_the_suite_command(tmp_path):
     assert "already holds a dataset" in again.stderr
     unknown = kpbench("suite", "paper-v9", code=1)
     assert unknown.stderr == (
-        "kpbench: there is no suite 'paper-v9', only: extended-v1, paper-v1, or a .toml file of your own\n"
+        "kpbench: there is no suite 'paper-v9', only: camera-v1, extended-v1, paper-v1, or a .toml file of your own\n"
     )
     kpbench("suite", "paper-v1", "--distortion", "much", code=2)
+
+
+def test_a_camera_that_cannot_be_used_is_one_line(tmp_path):
+    bad = tmp_path / "bad.yaml"
+    bad.write_text("image_width: 640\n")
+    made = ("suite", "paper-v1", "--images", 1, "--size", "203x155", "--out", tmp_path / "out", "--camera")
+    for name, problem in (
+        (
+            "no-such",
+            "there is no camera 'no-such', only: action-cam, industrial, phone, webcam, or a .toml, .yaml or .json",
+        ),
+        (bad, f"{bad}: camera_matrix is missing, expected the keys of OpenCV, ROS or Kalibr"),
+        (tmp_path / "none.yaml", f"{tmp_path / 'none.yaml'}: "),
+    ):
+        done = kpbench(*made, name, code=1)
+        assert done.stderr.startswith(f"kpbench: {problem}")
+        assert done.stderr.count("\n") == 1

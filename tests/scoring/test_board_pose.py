@@ -12,7 +12,8 @@ from kpbench.report.result_files import encode_scores
 from kpbench.report.score_tables import pose_table
 from kpbench.scoring.board_pose import PoseErrors, compute_pose_errors, group_pose_errors
 from kpbench.scoring.scores import score
-from kpbench.synth.suite import SuiteConfig, board_in_view
+from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_boards import board_in_view
 from kpbench.synth.suite_file import load_suite
 from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
 
