@@ -117,7 +117,7 @@ class CameraPreset:
         >>> from kpbench.camera import load_camera_preset
         >>> preset = load_camera_preset("webcam").with_values({"bits": 8, "tone": "linear"})
         >>> dict(preset.spans)["bits"], preset.tones
-        ((8, 8), ('linear',))
+        ((8.0, 8.0), ('linear',))
         """
         spans = tuple((key, (float(values[key]),) * 2 if key in values else span) for key, span in self.spans)
         tones = (str(values["tone"]),) if "tone" in values else self.tones
