@@ -9,13 +9,14 @@ start from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
+from kpbench.fitting.covariance import PIXEL_VARIANCE, centre_covariance, richer_columns, start_covariance
 from kpbench.geometry.coverage import Box, rasterise
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -63,6 +64,9 @@ class Fit:
         Correlation of model and pixels over the patch without a margin at its edge, in [-1, 1].
     noise : ndarray of shape (N,)
         Standard deviation of the residuals, grey levels.
+    covariance : ndarray of shape (N, 2, 2)
+        Covariance of the error of ``xy``, px², see :mod:`kpbench.fitting.covariance`. If the pixels allow no step, it
+        is the covariance of the starting pose.
 
     Examples
     --------
@@ -83,6 +87,7 @@ class Fit:
     blur_px: Float
     ncc: Float
     noise: Float
+    covariance: Float
 
 
 def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]) -> Fit:
@@ -117,7 +122,8 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
     array([[31.5, 31.5]])
     """
     size = np.linalg.norm(A, 2, axis=(1, 2)) * [p.extent for p in patches] if len(patches) else np.zeros(0)
-    states = [_State(xy[n], A[n], A[n], np.zeros(2), 0.5) for n in range(len(patches))]
+    covariance = start_covariance(A)
+    states = [_State(xy[n], A[n], A[n], np.zeros(2), 0.5, covariance=covariance[n]) for n in range(len(patches))]
     for largest_px, steps in ((COARSE_PX, COARSE_STEPS), (FINE_PX, FINE_STEPS)):
         octave = np.ceil(np.log2(np.maximum(size, 1e-6) / largest_px))
         level = np.clip(octave, 0, len(levels) - 1).astype(np.int64).tolist()
@@ -127,12 +133,12 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
             boxes = [_bounding_box(states[n], patches[n].extent) for n in live]
             covers = rasterise([_black_polygons(states[n], patches[n]) for n in live], boxes)
             for n, box, cover in zip(live, boxes, covers, strict=True):
-                last = largest_px == FINE_PX and step == steps - 1
-                states[n] = _step(states[n], levels[level[n]], box, cover, patches[n].extent, last)
+                left = steps - 1 - step if largest_px == FINE_PX else FINE_STEPS
+                states[n] = _step(states[n], levels[level[n]], box, cover, patches[n].extent, left)
         states = [_scale_state(state, n) for state, n in zip(states, level, strict=True)]
     columns = [np.array([getattr(s, name) for s in states]) for name in ("black", "white", "blur", "ncc", "noise")]
-    xy, A = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A"))
-    return Fit(xy.reshape(-1, 2), A.reshape(-1, 2, 2), *columns)
+    xy, A, covariance = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A", "covariance"))
+    return Fit(xy.reshape(-1, 2), A.reshape(-1, 2, 2), *columns, covariance.reshape(-1, 2, 2))
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,7 @@ class _State:
     white: float = 0.0
     ncc: float = 0.0
     noise: float = np.inf
+    covariance: Float = field(default_factory=lambda: np.zeros((2, 2)))
     moved: float = np.inf
     tone: tuple[float, float] = (0.0, 0.0)
 
@@ -168,9 +175,8 @@ def _scale_state(state: _State, octaves: int) -> _State:
         blur = np.hypot(blur, LEVEL_BLUR_PX)
     else:
         blur = np.sqrt(max(blur**2 - (LEVEL_BLUR_PX * factor) ** 2, 0.04))
-    return replace(
-        state, xy=state.xy * factor, A=state.A * factor, window=state.window * factor, blur=float(blur), moved=np.inf
-    )
+    xy, A, window, covariance = state.xy * factor, state.A * factor, state.window * factor, state.covariance * factor**2
+    return replace(state, xy=xy, A=A, window=window, blur=float(blur), covariance=covariance, moved=np.inf)
 
 
 def _bounding_box(state: _State, extent: float) -> Box:
@@ -206,8 +212,11 @@ def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
     return tuple(polygons)
 
 
-def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, last: bool) -> _State:
-    """Measure the residuals of a state. Unless ``last`` is true, also take one Gauss-Newton step."""
+def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, left: int) -> _State:
+    """Measure the residuals of a state. If ``left`` > 0 calls are left after this one, also take a Gauss-Newton step.
+
+    The last step of a patch also measures the covariance.
+    """
     x, y, w, h = box
     rows, columns = image.shape
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, columns), min(y + h, rows)
@@ -219,8 +228,8 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     minor = max(float(short_semi_axis(state.window[None])[0]), 1e-6)
     reach = max(extent - (0.35 + MARGIN_BLURS * state.blur) / minor, 0.5)
     a, b, c, d = _inverse(state.window)
-    inside = (a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < reach**2
-    grey, m = image[y0:y1, x0:x1][inside], ink[inside]
+    inside = np.flatnonzero((a * dx + b * dy) ** 2 + (c * dx + d * dy) ** 2 < reach**2)
+    grey, m = image[y0:y1, x0:x1].ravel()[inside], ink.ravel()[inside]
     if len(m) < LEAST_PIXELS:
         return state
     toned, steep, even, odd = _tone_curve(m, *state.tone)
@@ -233,25 +242,42 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     ncc = np.sqrt(max(0.0, 1 - unexplained / max(spread, 1e-9))) * (1 if slope < 0 else -1)
     noise = float(np.sqrt(unexplained * len(m) / max(len(m) - 9, 1)))
     state = replace(state, black=white + slope, white=white, ncc=float(ncc), noise=noise)
-    if last or slope > -1:
+    if not left or slope > -1:
         return state
-    gx, gy = (cv2.Sobel(ink, cv2.CV_32F, *axis, ksize=1, scale=0.5) for axis in ((1, 0), (0, 1)))
-    gx, gy, laplace = gx[inside], gy[inside], cv2.Laplacian(ink, cv2.CV_32F)[inside]
+    gx, gy = (cv2.Sobel(ink, cv2.CV_32F, *axis, ksize=1, scale=0.5).ravel()[inside] for axis in ((1, 0), (0, 1)))
     edge = np.flatnonzero(gx * gx + gy * gy > 1e-4)  # only pixels on edges depend on the pose
     if len(edge) < LEAST_PIXELS:
         return state
-    at_y, at_x = np.divmod(np.flatnonzero(inside)[edge], inside.shape[1])
-    gx, gy, laplace = (steep[edge] * part[edge] for part in (gx, gy, laplace))
-    dx, dy, m, residual, even, odd = dx[at_x], dy[at_y, 0], toned[edge], residual[edge], even[edge], odd[edge]
+    at = inside[edge]
+    at_y = at // (x1 - x0)
+    laplace, steep = cv2.Laplacian(ink, cv2.CV_32F).ravel()[at], steep[edge]
+    gx, gy, laplace = steep * gx[edge], steep * gy[edge], steep * laplace
+    dx, dy = dx[at - at_y * (x1 - x0)], dy[at_y, 0]
+    m, residual, even, odd = toned[edge], residual[edge], even[edge], odd[edge]
     a, b, c, d = _inverse(state.A)
     u, v, outward = a * dx + b * dy, c * dx + d * dy, gx * dx + gy * dy
-    shifts = (-gx, -gy, -gx * u, -gx * v, -gy * u, -gy * v, outward * u, outward * v, laplace / 2, even, odd)
-    moves = np.stack([np.ones_like(m), m, *(slope * g for g in shifts)])
+    left_x, left_y = -gx, -gy
+    shifts = (left_x, left_y, left_x * u, left_x * v, left_y * u, left_y * v, outward * u, outward * v)
+    moves = np.empty((13, len(m)))
+    moves[0], moves[1] = 1.0, m
+    for row, derivative in enumerate((*shifts, laplace / 2, even, odd), start=2):
+        np.multiply(derivative, slope, out=moves[row])
     # pixels that the model cannot explain, such as shadow edges, rain and occluders, get a smaller weight
     size, half = np.abs(residual), len(residual) // 2
     usual = 2.5 * 1.48 * float(np.partition(size, half)[half]) + 1.0
     weighted = moves * np.minimum(1.0, usual / np.maximum(size, 1e-6))
-    return _solve_step(state, weighted @ moves.T, weighted @ residual, minor, extent)
+    normal = weighted @ moves.T
+    stepped, change = _solve_step(state, normal, weighted @ residual, minor, extent)
+    if left > 1 and stepped.moved > SETTLED_STEP:
+        return stepped
+    columns = richer_columns(ink, at, white + slope * m, slope * steep, (slope * minor * gx, slope * minor * gy), (u, v))
+    covariance = centre_covariance(moves, weighted, residual, normal, change, columns)
+    return replace(stepped, covariance=covariance * max(1.0, _edge_width(stepped.blur) / _edge_width(state.blur)))
+
+
+def _edge_width(blur: float) -> float:
+    """Return the standard deviation of an edge's profile, px. The variance of a centre is proportional to it."""
+    return float(np.sqrt(blur**2 + PIXEL_VARIANCE))
 
 
 def _tone_curve(ink: Float32, a: float, b: float) -> tuple[Float32, Float32, Float32, Float32]:
@@ -281,31 +307,39 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
     return d / det, -b / det, -c / det, a / det
 
 
-def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float) -> _State:
-    """Solve the normal equations and take the step, within limits.
+def _solve_step(
+    state: _State, normal: Float, target: Float, minor: float, extent: float
+) -> tuple[_State, Float]:
+    """Solve the normal equations and take the step, within limits. Return the new state and the change of the unknowns.
+
+    The priors are added to ``normal``.
 
     The unknowns are white, black minus white, x, y, four entries of A, two entries of the bend, the square of the blur,
     and the two coefficients of the tone curve.
     """
     # the pixels of a design of sectors alone do not determine its size and some stretches, so damping holds them
-    damped = np.arange(4, 11)
-    normal[damped, damped] += 1e-3 * normal[damped, damped] + 1e-3
-    normal[[0, 1, 2, 3], [0, 1, 2, 3]] += 1e-3
+    diagonal = normal.reshape(-1)[:: len(normal) + 1]
+    diagonal[4:11] += 1e-3 * diagonal[4:11] + 1e-3
+    diagonal[:4] += 1e-3
+    tone = np.array(state.tone)
     prior = (state.noise**2 + 1) / (EXPECTED_BEND_PER_PX * minor) ** 2
-    normal[[8, 9], [8, 9]] += prior
+    diagonal[8:10] += prior
     target[8:10] -= prior * state.bend
     prior = (state.noise**2 + 1) / EXPECTED_TONE**2
-    normal[[11, 12], [11, 12]] += prior
-    target[11:13] -= prior * np.array(state.tone)
+    diagonal[11:13] += prior
+    target[11:13] -= prior * tone
     delta = np.linalg.solve(normal, target)
-    shift, grow = delta[2:4], delta[4:8].reshape(2, 2)
-    shift = shift * min(1.0, 0.3 * minor / max(float(np.hypot(*shift)), 1e-9))
-    grow = grow * min(1.0, 0.2 * minor / max(float(np.abs(grow).max()), 1e-9))
-    blur = float(np.sqrt(np.clip(state.blur**2 + np.clip(delta[10], -1, 1), 0.04, (0.5 * minor) ** 2)))
-    bend = np.clip(state.bend + delta[8:10], -0.3, 0.3)
+    shift = delta[2:4] * min(1.0, 0.3 * minor / max(float(np.hypot(*delta[2:4].tolist())), 1e-9))
+    grow = delta[4:8] * min(1.0, 0.2 * minor / max(float(np.abs(delta[4:8]).max()), 1e-9))
+    widened = state.blur**2 + min(max(float(delta[10]), -1.0), 1.0)
+    blur = float(np.sqrt(min(max(widened, 0.04), (0.5 * minor) ** 2)))
+    bend = np.minimum(np.maximum(state.bend + delta[8:10], -0.3), 0.3)
     # a stronger bend would put part of the model behind the camera
-    bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend)), 1e-9)))
-    tone = np.clip(np.array(state.tone) + delta[11:13], -LARGEST_TONE, LARGEST_TONE)
+    bend *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*bend.tolist())), 1e-9)))
+    tone = np.minimum(np.maximum(tone + delta[11:13], -LARGEST_TONE), LARGEST_TONE)
     moved = max(float(np.abs(shift).max()), float(np.abs(grow).max())) / minor
+    turned = grow.reshape(2, 2)
     a, b = tone.tolist()
-    return replace(state, xy=state.xy + shift, A=state.A + grow, bend=bend, blur=blur, moved=moved, tone=(a, b))
+    change = np.array([*delta[:2], *shift, *grow, *(bend - state.bend), blur**2 - state.blur**2, *(tone - state.tone)])
+    stepped = replace(state, xy=state.xy + shift, A=state.A + turned, bend=bend, blur=blur, moved=moved, tone=(a, b))
+    return stepped, change
