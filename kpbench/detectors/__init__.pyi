@@ -1,3 +1,4 @@
+from .hypotheses import VerifiedCandidates as VerifiedCandidates
 from .interface import DETECTORS as DETECTORS
 from .interface import Detector as Detector
 from .interface import LoadedDetector as LoadedDetector
@@ -14,7 +15,6 @@ from .superpoint import decode as decode
 from .superpoint import keypoint_probability as keypoint_probability
 from .suppression import suppress as suppress
 from .template import TemplateDetector as TemplateDetector
-from .verification import VerifiedCandidates as VerifiedCandidates
 from .verification import verify_candidates as verify_candidates
 
 __all__: list[str]

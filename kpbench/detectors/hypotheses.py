@@ -93,6 +93,8 @@ class Hypotheses:
         Index of the design.
     xy, A : ndarray of shape (n, 2) and (n, 2, 2)
         Pose: the centre, px, and the map from the patch frame to px.
+    covariance : ndarray of shape (n, 2, 2)
+        Covariance of the error of ``xy``, px².
     view : ndarray of shape (n, VIEW_PX²)
         The image in the frame of the patch, from :func:`kpbench.fitting.views.rectify`; nan outside the image.
     blur_px : ndarray of shape (n,)
@@ -106,6 +108,7 @@ class Hypotheses:
     design: Int
     xy: Float
     A: Float
+    covariance: Float
     view: NDArray[np.floating[Any]]
     blur_px: Float
     evidence: Float
@@ -120,6 +123,47 @@ class Hypotheses:
     def concatenate(cls, parts: Sequence[Hypotheses]) -> Hypotheses:
         """Return the hypotheses of all parts, part by part."""
         return cls(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
+
+
+@dataclass(frozen=True)
+class VerifiedCandidates:
+    """The n candidates that passed all steps, each with its likeliest design.
+
+    Attributes
+    ----------
+    place : ndarray of shape (n,), int64
+        Index of the candidate.
+    design : ndarray of shape (n,), int64
+        Index of the design.
+    xy : ndarray of shape (n, 2)
+        Fitted centre, px.
+    A : ndarray of shape (n, 2, 2)
+        Map from the patch frame to px.
+    covariance : ndarray of shape (n, 2, 2)
+        Covariance of the error of ``xy``, px².
+    blur_px : ndarray of shape (n,)
+        Standard deviation of the fitted blur, px.
+    score : ndarray of shape (n,)
+        Probability that there is a patch of this design and that the centre is right.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.detectors import verify_candidates
+    >>> image, no_places = np.full((48, 64), 120, np.uint8), np.zeros((0, 2))
+    >>> found = verify_candidates(image, no_places, np.zeros(0), np.zeros((0, 5)), kpbench.shipped_patches())
+    >>> found.place, found.score
+    (array([], dtype=int64), array([], dtype=float64))
+    """
+
+    place: Int
+    design: Int
+    xy: Float
+    A: Float
+    covariance: Float
+    blur_px: Float
+    score: Float
 
 
 def select_likeliest(place: Int, log_odds: Float) -> Int:

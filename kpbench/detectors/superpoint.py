@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.detectors.hypotheses import clipped_semi_axis
 from kpbench.detectors.inference import open_session, runs_on_gpu, try_network
 from kpbench.detectors.suppression import suppress
 from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
@@ -368,9 +369,11 @@ class SuperPointDetector:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
         found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads)
         likely = np.flatnonzero((found.score >= self._threshold) & _inside(found.xy, grey))
-        xy, score, reach = found.xy[likely], found.score[likely], DISC_SHARE * found.minor_px[likely]
+        xy, score, reach = found.xy[likely], found.score[likely], DISC_SHARE * clipped_semi_axis(found.A[likely])
         kept = suppress(xy, score, np.maximum(Decoding.separation_px, reach))
-        return Detections(xy[kept], score[kept], self._patch_ids[found.design[likely[kept]]])
+        rows = likely[kept]
+        pose = found.A[rows], found.covariance[rows], found.blur_px[rows]
+        return Detections(xy[kept], score[kept], self._patch_ids[found.design[rows]], *pose)
 
 
 @dataclass

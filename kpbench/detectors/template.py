@@ -278,7 +278,8 @@ class TemplateDetector:
         order = order[score[order] >= self.threshold]
         kept = order[_select_uncovered(found.fit.xy[order], found.fit.A[order])]
         ids = np.array([patch.patch_id for patch in self.patches], np.int64)
-        return Detections(found.fit.xy[kept], score[kept], ids[found.design[kept]])
+        pose = found.fit.A[kept], found.fit.covariance[kept], found.fit.blur_px[kept]
+        return Detections(found.fit.xy[kept], score[kept], ids[found.design[kept]], *pose)
 
     detect = __call__
 

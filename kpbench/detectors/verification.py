@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -35,6 +35,7 @@ import numpy as np
 from kpbench.detectors.hypotheses import (
     Evidence,
     Hypotheses,
+    VerifiedCandidates,
     clipped_semi_axis,
     judge_inputs,
     select_distinct,
@@ -42,6 +43,7 @@ from kpbench.detectors.hypotheses import (
 )
 from kpbench.detectors.inference import InferenceSession, open_session
 from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, rotate_within_ellipse
+from kpbench.fitting.covariance import start_covariance
 from kpbench.fitting.design_fit import fit
 from kpbench.fitting.pyramid import Pyramids
 from kpbench.fitting.templates import DesignTemplates, build_templates
@@ -90,41 +92,6 @@ LEAST_CONTRAST = 2.0
 """
 PLACES_PER_BLOCK = 2**11
 """Largest number of places that the ellipse network sees in one call. This limits the memory use."""
-
-
-@dataclass(frozen=True)
-class VerifiedCandidates:
-    """The n candidates that passed all steps, each with its likeliest design.
-
-    Attributes
-    ----------
-    place : ndarray of shape (n,), int64
-        Index of the candidate.
-    design : ndarray of shape (n,), int64
-        Index of the design.
-    xy : ndarray of shape (n, 2)
-        Fitted centre, px.
-    minor_px : ndarray of shape (n,)
-        Short semi-axis of the fitted disc, px.
-    score : ndarray of shape (n,)
-        Probability that there is a patch of this design and that the centre is right.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kpbench
-    >>> from kpbench.detectors import verify_candidates
-    >>> image, no_places = np.full((48, 64), 120, np.uint8), np.zeros((0, 2))
-    >>> found = verify_candidates(image, no_places, np.zeros(0), np.zeros((0, 5)), kpbench.shipped_patches())
-    >>> found.place, found.score
-    (array([], dtype=int64), array([], dtype=float64))
-    """
-
-    place: Int
-    design: Int
-    xy: Float
-    minor_px: Float
-    score: Float
 
 
 def verify_candidates(
@@ -179,7 +146,8 @@ def verify_candidates(
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
     found, log_odds = fitted[best], log_odds[best]
     score = 1 / (1 + np.exp(-log_odds))
-    return VerifiedCandidates(found.place, found.design, found.xy, clipped_semi_axis(found.A), score)
+    fitted_pose = found.xy, found.A, found.covariance, found.blur_px
+    return VerifiedCandidates(found.place, found.design, *fitted_pose, score)
 
 
 def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
@@ -291,7 +259,8 @@ def _measure(
         np.log(minor),
     ]
     evidence = np.column_stack([of_networks, *measured])
-    found = Hypotheses(place, place_xy, poses.design, poses.xy, poses.A, view, np.zeros(len(place)), evidence)
+    pose = poses.xy, poses.A, start_covariance(poses.A)
+    found = Hypotheses(place, place_xy, poses.design, *pose, view, np.zeros(len(place)), evidence)
     return found[half_contrast > LEAST_CONTRAST]
 
 
@@ -319,10 +288,11 @@ def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patc
     )
     far = move > LARGEST_FIT_MOVE
     xy, A = np.where(far[:, None], before.xy, fits.xy), np.where(far[:, None, None], before.A, fits.A)
+    covariance = np.where(far[:, None, None], start_covariance(before.A), fits.covariance)
     view, _ = rectify(pyramids.smooth, xy, A, before.design, build_templates(patches))
     shared = np.column_stack([np.log(fits.blur_px + 0.3), np.log(contrast)])
     evidence = np.column_stack([before.evidence, measured, _compare_with_others(xy, minor, log_odds, shared)])
-    return Hypotheses(before.place, before.place_xy, before.design, xy, A, view, fits.blur_px, evidence)
+    return Hypotheses(before.place, before.place_xy, before.design, xy, A, covariance, view, fits.blur_px, evidence)
 
 
 def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Float) -> Float:

@@ -3,32 +3,38 @@
 The last step of a fit gives the normal matrix and the residuals. Four parts are added:
 
 1. Noise. If all residuals were independent noise of variance s², the covariance of the unknowns would be
-   s² N⁻¹ (J W² Jᵀ) N⁻¹, with the derivatives J, the robust weights W and the normal matrix N = J W Jᵀ + priors (P. Huber,
-   *Robust Statistics*, 1981, chapter 7).
-2. What a richer model would change. Real images have light that falls off across a patch, a blur that is wider in one
-   direction, and bent lenses and paper. The fit has no unknowns for these. Their coefficients are estimated from the
-   residuals, with priors. They say how far the centre would move if they were unknowns of the fit.
+   s² N⁻¹ (J W² Jᵀ) N⁻¹, with the derivatives J, the robust weights W and the normal matrix N = J W Jᵀ + priors
+   (P. Huber, *Robust Statistics*, 1981, chapter 7).
+2. What a richer model would change. In real images, light falls off across a patch, and blur is wider in one direction.
+   The fit has no unknowns for these. Their coefficients are estimated from the residuals, with priors. They say how far
+   the centre would move if they were unknowns of the fit.
 3. The rest of the way. A fit stops before it stands still. The centre is still off by a share of its last step.
 4. Rejected pixels. Robust weights below 1 tell that the model is wrong in places.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from kpbench.types import Float, Float32, Int
+
+Real = NDArray[np.floating[Any]]
 
 LEAST_VARIANCE = 0.1
 """Lower limit of the variance of the noise, squared grey levels. Rounding to whole grey levels alone has 1/12."""
 PIXEL_VARIANCE = 1 / 12
 """Variance of the blur that the area of a pixel adds, px²."""
+LEVEL_GRAIN = 3.3
+"""Grain of the noise in every pyramid level but level 0, see :func:`centre_covariance`. The kernel (1, 4, 6, 4, 1) of
+the pyramid leaves a correlation of 28/70 between neighbours, and of 1/70 at two pixels: (1 + 2·29/70)² = 3.3."""
 LIGHT_SLOPE = 0.03
 """Prior of the richer model: standard deviation of the change of light from the centre to the rim, as a share."""
 UNEVEN_BLUR_PX2 = 1.2
 """Prior of the richer model: standard deviation of the difference of the blur's variances in two directions, px²."""
-CURVATURE = 0.02
-"""Prior of the richer model: standard deviation of the shift of the rim by curvature, in short semi-axes."""
 RICHER_SHARE = 0.75
 """Share of the shift by the richer model that is counted. Chosen on training photographs."""
 LAST_STEP_SHARE = 0.3
@@ -54,12 +60,11 @@ def start_covariance(A: Float) -> Float:
     return np.asarray(START_ERROR**2 * A @ np.swapaxes(A, -1, -2))
 
 
-def richer_columns(
-    ink: Float32, at: Int, grey: Float32, steep: Float32, shifts: tuple[Float32, Float32], uv: tuple[Float, Float]
-) -> Float32:
-    """Return the derivatives (10, n) of a patch's n grey values with respect to the unknowns of the richer model.
+def richer_columns(ink: Float32, at: Int, grey: Real, steep: Real, u: Real, v: Real) -> Real:
+    """Return the derivatives (4, n) of n grey values of a patch with respect to the unknowns of the richer model.
 
-    Each unknown has a prior with standard deviation 1.
+    The unknowns are the slope of the light along u and v, and the unevenness of the blur: half the difference of its
+    variances along x and y, and its covariance. Each has a prior with standard deviation 1.
 
     Parameters
     ----------
@@ -71,23 +76,17 @@ def richer_columns(
         Grey values of the model.
     steep : ndarray of shape (n,)
         Derivatives of the grey values with respect to the ink.
-    shifts : tuple of two ndarrays of shape (n,)
-        Derivatives of the grey values with respect to shifts of the ink by one short semi-axis along x and along y.
-    uv : tuple of two ndarrays of shape (n,)
+    u, v : ndarray of shape (n,)
         Places in the patch frame.
     """
-    u, v = (part.astype(np.float32) for part in uv)
-    xx, yy = (cv2.Sobel(ink, cv2.CV_32F, *order, ksize=1).ravel().take(at) for order in ((2, 0), (0, 2)))
-    xy = cv2.Sobel(ink, cv2.CV_32F, 1, 1, ksize=3, scale=0.25).ravel().take(at)
-    lit, uneven = np.float32(LIGHT_SLOPE) * grey, np.float32(UNEVEN_BLUR_PX2 / 2) * steep
-    gx, gy = (np.float32(CURVATURE) * part for part in shifts)
-    squares = (u * u, u * v, v * v)
-    bent = [part * square for part in (gx, gy) for square in squares]
-    return np.stack([lit * u, lit * v, uneven / 2 * (xx - yy), uneven * xy, *bent])
+    xx, yy = (cv2.Sobel(ink, cv2.CV_32F, *order, ksize=1).ravel()[at] for order in ((2, 0), (0, 2)))
+    xy = cv2.Sobel(ink, cv2.CV_32F, 1, 1, ksize=3, scale=0.25).ravel()[at]
+    light, uneven = LIGHT_SLOPE * grey, UNEVEN_BLUR_PX2 / 2 * steep
+    return np.stack([light * u, light * v, uneven / 2 * (xx - yy), uneven * xy])
 
 
 def centre_covariance(
-    moves: Float32, weighted: Float32, residual: Float32, normal: Float, change: Float, richer: Float32
+    moves: Float, weighted: Float, residual: Float32, normal: Float, change: Float, richer: Real, grain: float
 ) -> Float:
     """Return the covariance (2, 2) of a fitted centre, px², without the effect of a change of blur.
 
@@ -106,14 +105,17 @@ def centre_covariance(
         The last step.
     richer : ndarray of shape (m, n)
         From :func:`richer_columns`.
+    grain : float
+        Variance of the mean of many neighbouring pixels' noise, relative to independent noise.
     """
     inverse, weight = np.linalg.inv(normal), weighted[0]
     total = float(weight.sum())
     columns = np.concatenate([richer, (residual - change @ moves)[None]])
     across = weighted @ columns.T
-    # products of the columns, after the unknowns of the fit have taken their part
-    products = (columns * weight) @ columns.T - across.T @ (inverse @ across)
-    within, target, squares = products[:-1, :-1], products[:-1, -1], float(products[-1, -1])
+    products = (columns * weight) @ columns.T
+    squares = float(products[-1, -1])
+    products -= across.T @ (inverse @ across)  # the unknowns of the fit take their part
+    within, target = products[:-1, :-1], products[:-1, -1]
     degrees = max(total - len(moves), 1.0)
     prior = max(squares / degrees, LEAST_VARIANCE) * np.eye(len(within))
     found = np.linalg.solve(within + prior, target)
@@ -122,5 +124,5 @@ def centre_covariance(
     step, rejected = LAST_STEP_SHARE * change[2:4], REJECTED_PX * (1 - total / len(weight)) ** 2
     even = float(step @ step) + rejected**2
     return np.asarray(
-        variance * (influence @ influence.T) + np.outer(shift, shift) + np.outer(step, step) + even * np.eye(2)
+        grain * variance * (influence @ influence.T) + np.outer(shift, shift) + np.outer(step, step) + even * np.eye(2)
     )

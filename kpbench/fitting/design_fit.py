@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
-from kpbench.fitting.covariance import PIXEL_VARIANCE, centre_covariance, richer_columns, start_covariance
+from kpbench.fitting.covariance import LEVEL_GRAIN, PIXEL_VARIANCE, centre_covariance, richer_columns, start_covariance
 from kpbench.geometry.coverage import Box, rasterise
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -134,11 +134,13 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
             covers = rasterise([_black_polygons(states[n], patches[n]) for n in live], boxes)
             for n, box, cover in zip(live, boxes, covers, strict=True):
                 left = steps - 1 - step if largest_px == FINE_PX else FINE_STEPS
-                states[n] = _step(states[n], levels[level[n]], box, cover, patches[n].extent, left)
+                image, grain = levels[level[n]], LEVEL_GRAIN if level[n] else 1.0
+                states[n] = _step(states[n], image, box, cover, patches[n].extent, left, grain)
         states = [_scale_state(state, n) for state, n in zip(states, level, strict=True)]
     columns = [np.array([getattr(s, name) for s in states]) for name in ("black", "white", "blur", "ncc", "noise")]
-    xy, A, covariance = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A", "covariance"))
-    return Fit(xy.reshape(-1, 2), A.reshape(-1, 2, 2), *columns, covariance.reshape(-1, 2, 2))
+    xy, A, C = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A", "covariance"))
+    black, white, blur, ncc, noise = columns
+    return Fit(xy.reshape(-1, 2), A.reshape(-1, 2, 2), black, white, blur, ncc, noise, C.reshape(-1, 2, 2))
 
 
 @dataclass(frozen=True)
@@ -212,17 +214,21 @@ def _black_cells(patch: Patch, tolerance: float) -> tuple[Float, ...]:
     return tuple(polygons)
 
 
-def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, left: int) -> _State:
+def _step(
+    state: _State, image: Float32, box: Box, cover: Float, extent: float, left: int, grain: float = 1.0
+) -> _State:
     """Measure the residuals of a state. If ``left`` > 0 calls are left after this one, also take a Gauss-Newton step.
 
-    The last step of a patch also measures the covariance.
+    The last step of a patch also measures the covariance, with noise of this ``grain``, see
+    :func:`kpbench.fitting.covariance.centre_covariance`.
     """
     x, y, w, h = box
     rows, columns = image.shape
     x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + w, columns), min(y + h, rows)
     if x1 - x0 < 3 or y1 - y0 < 3:
         return state
-    ink = cv2.GaussianBlur(cover.astype(np.float32), (0, 0), max(state.blur, 0.2), borderType=cv2.BORDER_REPLICATE)
+    blur = max(state.blur, 0.2)
+    ink: Float32 = np.asarray(cv2.GaussianBlur(cover.astype(np.float32), (0, 0), blur, borderType=cv2.BORDER_REPLICATE))
     ink = ink[y0 - y : y1 - y, x0 - x : x1 - x]
     dx, dy = np.arange(x0, x1) - state.xy[0], np.arange(y0, y1)[:, None] - state.xy[1]
     minor = max(float(short_semi_axis(state.window[None])[0]), 1e-6)
@@ -270,8 +276,8 @@ def _step(state: _State, image: Float32, box: Box, cover: Float, extent: float, 
     stepped, change = _solve_step(state, normal, weighted @ residual, minor, extent)
     if left > 1 and stepped.moved > SETTLED_STEP:
         return stepped
-    columns = richer_columns(ink, at, white + slope * m, slope * steep, (slope * minor * gx, slope * minor * gy), (u, v))
-    covariance = centre_covariance(moves, weighted, residual, normal, change, columns)
+    richer = richer_columns(ink, at, white + slope * m, slope * steep, u, v)
+    covariance = centre_covariance(moves, weighted, residual, normal, change, richer, grain)
     return replace(stepped, covariance=covariance * max(1.0, _edge_width(stepped.blur) / _edge_width(state.blur)))
 
 
@@ -307,9 +313,7 @@ def _inverse(m: Float) -> tuple[float, float, float, float]:
     return d / det, -b / det, -c / det, a / det
 
 
-def _solve_step(
-    state: _State, normal: Float, target: Float, minor: float, extent: float
-) -> tuple[_State, Float]:
+def _solve_step(state: _State, normal: Float, target: Float, minor: float, extent: float) -> tuple[_State, Float]:
     """Solve the normal equations and take the step, within limits. Return the new state and the change of the unknowns.
 
     The priors are added to ``normal``.

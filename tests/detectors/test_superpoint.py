@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
+from kpbench.detectors.hypotheses import VerifiedCandidates
 from kpbench.detectors.inference import open_session
 from kpbench.detectors.interface import load_detector
 from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector, decode, pad_to_cells
-from kpbench.detectors.verification import VerifiedCandidates
 from kpbench.errors import DataError
 from kpbench.patches.design import parse_patch, shipped_patches
 
@@ -221,7 +221,9 @@ def test_the_shipped_weights_find_large_clean_patches(name):
 @pytest.mark.parametrize("x", [-0.6, -0.4, 99.4, 99.6])
 def test_a_verified_detection_lies_in_the_image(monkeypatch, x):
     """A fit may move a centre over the image's border, which is half a pixel outside the last pixel's centre."""
-    fitted = VerifiedCandidates(np.array([0]), np.array([1]), np.array([[x, 50.0]]), np.array([20.0]), np.array([0.9]))
+    A = np.eye(2)[None]
+    pose = np.array([[x, 50.0]]), 20.0 * A, 0.01 * A, np.array([0.5])
+    fitted = VerifiedCandidates(np.array([0]), np.array([1]), *pose, np.array([0.9]))
     monkeypatch.setattr("kpbench.detectors.superpoint.verify_candidates", lambda *candidates: fitted)
     found = SmallSuperPointDetector()(np.zeros((100, 100), np.uint8))
     assert len(found) == (-0.5 < x < 99.5)

@@ -16,6 +16,7 @@ from kpbench.detectors.verification import (
     propose_poses,
     verify_candidates,
 )
+from kpbench.fitting.align import short_semi_axis
 from kpbench.fitting.pyramid import Pyramids
 from kpbench.patches.design import shipped_patches
 from kpbench.render.placement import Placement
@@ -100,7 +101,7 @@ def test_a_small_patch_is_not_taken_for_a_large_one_that_the_background_resemble
     xy = np.column_stack([rendered.keypoints["x"], rendered.keypoints["y"]])
     found = verify(rendered.image, xy + 0.7, [2], sure=0.99)
     np.testing.assert_allclose(found.xy, xy, atol=0.05)
-    assert found.minor_px[0] == pytest.approx(rendered.keypoints["radius_minor"][0], rel=0.05)
+    assert short_semi_axis(found.A)[0] == pytest.approx(rendered.keypoints["radius_minor"][0], rel=0.05)
 
 
 def test_of_hypotheses_of_one_design_that_cover_each_other_the_likeliest_is_fitted():
@@ -108,7 +109,7 @@ def test_of_hypotheses_of_one_design_that_cover_each_other_the_likeliest_is_fitt
     design, odds = np.array([0, 0, 1, 0, 0]), np.array([1.0, 2.0, -1.0, 0.5, LEAST_FIT_LOG_ODDS - 0.1])
     A = np.tile(np.eye(2) * 10, (5, 1, 1))
     nothing = np.zeros((5, 0))
-    found = Hypotheses(np.arange(5), xy, design, xy, A, nothing, np.zeros(5), nothing)
+    found = Hypotheses(np.arange(5), xy, design, xy, A, A, nothing, np.zeros(5), nothing)
     assert select_distinct(found, odds, LEAST_FIT_LOG_ODDS).tolist() == [1, 2, 3]
     assert select_distinct(found[:0], odds[:0], LEAST_FIT_LOG_ODDS).tolist() == []
 
