@@ -295,7 +295,7 @@ def _detect_parts(parts: Sequence[_Part], workers: int | None, progress: Progres
     missing = [part for part in parts if not part.file.exists()]
     progress(sum(part.count for part in parts) - sum(part.count for part in missing))
     try:
-        for _ in run_jobs(_detect_part, missing, workers, progress):
+        for _ in run_jobs(_detect_part, missing, workers, progress, share_cores=True):
             pass
     except BaseException:
         remove_leftovers(part.file for part in missing)  # of killed workers

@@ -56,6 +56,7 @@ def run_jobs(
     workers: int | None,
     progress: Progress,
     executor: Executor | None = None,
+    share_cores: bool = False,
 ) -> Iterator[ResultT]:
     """Yield the result of every job as soon as the job is finished, in any order.
 
@@ -71,6 +72,8 @@ def run_jobs(
         Called in this process with the number of images finished since its last call.
     executor : concurrent.futures.Executor, optional
         Runs the jobs in place of worker processes. ``progress`` is then called once per finished job.
+    share_cores : bool
+        Let OpenCV, BLAS and torch use cores / workers threads in each worker process. False: one thread.
 
     Raises
     ------
@@ -78,12 +81,13 @@ def run_jobs(
         If a worker process dies.
     """
     workers = min(workers or count_cores(), len(jobs))
+    threads = max(1, count_cores() // max(1, workers)) if share_cores else 1
     if executor is not None:
         yield from _run_on_executor(work, jobs, executor, progress)
     elif workers > 1:
-        yield from _run_in_processes(work, jobs, workers, progress)
+        yield from _run_in_processes(work, jobs, workers, threads, progress)
     else:
-        with _one_thread():
+        with _limited_threads(threads):
             for job in jobs:
                 yield work(job, progress)
 
@@ -104,9 +108,9 @@ def _run_on_executor(
 
 
 def _run_in_processes(
-    work: Callable[[JobT, Progress], ResultT], jobs: Sequence[JobT], workers: int, progress: Progress
+    work: Callable[[JobT, Progress], ResultT], jobs: Sequence[JobT], workers: int, threads: int, progress: Progress
 ) -> Iterator[ResultT]:
-    with _process_pool(workers) as (pool, counter):
+    with _process_pool(workers, threads) as (pool, counter):
         reported = 0
 
         def report_progress() -> None:
@@ -168,8 +172,10 @@ def _restore_safe_path(value: str | None) -> None:
 
 
 @contextmanager
-def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
+def _process_pool(workers: int, threads: int = 1) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     """Start worker processes; yield their pool, and the counter of finished images that the processes share.
+
+    ``threads`` : number of threads of each process.
 
     The processes are killed if the block ends early: by an error, or because no more results are asked for.
     """
@@ -177,7 +183,7 @@ def _process_pool(workers: int) -> Iterator[tuple[ProcessPoolExecutor, Any]]:
     with block_end_signals(), _safe_path():
         resource_tracker.ensure_running()  # else the next line starts this process of multiprocessing
     counter, others = spawn.Value("q", 0), set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter, os.environ.get(SAFE_PATH)))
+    pool = ProcessPoolExecutor(workers, spawn, _start_worker, (counter, os.environ.get(SAFE_PATH), threads))
     with block_end_signals(), _safe_path():
         for _ in range(workers):
             pool.submit(int)  # each empty job starts a process, so that the next line finds all
@@ -237,10 +243,14 @@ def dask_executor(address: str) -> Iterator[Executor]:
             raise DataError(f"{address}: its workers died; {hint}") from None
 
 
-def use_one_thread() -> None:
-    """Make OpenCV and BLAS use one thread in this process; on small matrices, more threads take more time."""
-    cv2.setNumThreads(1)
-    threadpool_limits(1)
+def use_threads(count: int) -> None:
+    """Make OpenCV and BLAS use ``count`` threads in this process, and torch too if it is imported later.
+
+    On small matrices, more threads take more time.
+    """
+    os.environ.setdefault("OMP_NUM_THREADS", str(count))  # torch reads it; a user's own value stays
+    cv2.setNumThreads(count)
+    threadpool_limits(count)
     keep_freed_memory()
 
 
@@ -270,11 +280,11 @@ def _threadpool_controller() -> ThreadpoolController:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Make OpenCV and BLAS use one thread within a ``with`` block."""
+def _limited_threads(count: int) -> Iterator[None]:
+    """Make OpenCV and BLAS use ``count`` threads within a ``with`` block."""
     threads = cv2.getNumThreads()
-    with threadpool_limits(1):
-        cv2.setNumThreads(1)
+    with threadpool_limits(count):
+        cv2.setNumThreads(count)
         keep_freed_memory()
         try:
             yield
@@ -286,12 +296,12 @@ _counter: Any = None
 """The counter of finished images that a worker process shares with its parent."""
 
 
-def _start_worker(counter: Any, safe_path: str | None) -> None:
-    """Prepare a new worker process: use one thread, and end with the parent process."""
+def _start_worker(counter: Any, safe_path: str | None, threads: int) -> None:
+    """Prepare a new worker process: limit its threads, and let it end with the parent process."""
     global _counter
     _counter = counter
     _restore_safe_path(safe_path)  # for programs that the worker starts
-    use_one_thread()
+    use_threads(threads)
     _end_with_parent()
 
 
@@ -325,5 +335,5 @@ def _run_remote(work: Callable[[JobT, Progress], ResultT], job: JobT) -> tuple[R
         nonlocal total
         total += images
 
-    with _one_thread():
+    with _limited_threads(1):
         return work(job, add_to_total), total

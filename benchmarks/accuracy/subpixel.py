@@ -29,7 +29,7 @@ import kpbench
 from kpbench.detectors import SmallSuperPointDetector, keypoint_probability, verify_candidates
 from kpbench.training import SampleConfig, load_photos, make_batch
 from kpbench.types import Float, UInt8
-from kpbench.workers import use_one_thread
+from kpbench.workers import use_threads
 
 SIDE = 24
 FARTHEST_PX = 2.0
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--images", type=int, default=200)
     options = parser.parse_args()
-    use_one_thread()
+    use_threads(1)
     torch.set_num_threads(1)
     network = trained(options.backgrounds, options.minutes)
     dataset, detector = kpbench.open_dataset(options.dataset), SmallSuperPointDetector(threads=1, scales=(1.0,))
@@ -104,7 +104,7 @@ def main() -> None:
     for n in range(min(options.images, len(dataset))):
         grey, keypoints = dataset[n]
         total += len(keypoints)
-        xy, score, log_id = detector.candidates([grey])[0]
+        xy, score, log_id, _ = detector.candidates([grey])[0]
         if not len(xy) or not len(keypoints):
             continue
         found = {"mean": xy}

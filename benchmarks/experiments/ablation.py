@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from kpbench import load_patches, shipped_patches
 from kpbench.training import Phase, Recipe, TrainOptions, load_recipe, train
-from kpbench.workers import count_cores, use_one_thread
+from kpbench.workers import count_cores, use_threads
 
 RUNNER_UP = Path(__file__).parents[1] / "designs" / "runner-up"
 
@@ -81,7 +81,7 @@ VARIANTS: dict[str, Callable[[Recipe], Recipe]] = {
 
 def run(name: str, backgrounds: Path, samples: int) -> dict[str, float]:
     """The last validation of one variant."""
-    use_one_thread()
+    use_threads(1)
     recipe = load_recipe("reference")
     phase = Phase(samples, severity=(0.0, 0.5))
     recipe = replace(recipe, precision="bf16", seed=3, warmup=samples // 10, phases=(phase,))

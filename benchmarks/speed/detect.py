@@ -38,7 +38,7 @@ def main() -> None:
     rival = SuperPoint(NetworkConfig()).eval()
     steps: dict[str, Callable[[np.ndarray], object]] = {"PyTorch eager": lambda image: _torch(rival, image)}
     for name, (detector, alone) in detectors.items():
-        steps[f"{name}: network"] = lambda image, d=detector: [d.heads([view]) for view in _views(image, d.scales)]
+        steps[f"{name}: network"] = lambda image, d=detector: [d.heads([view]) for view in _views(image, d)]
         steps[f"{name}: places"] = lambda image, d=detector: d.candidates([image])
         steps[f"{name}: whole"] = detector
         steps[f"{name}: not verified"] = alone
@@ -62,9 +62,9 @@ def main() -> None:
         print(f"{name}: decoding {decoding:.0%} of the network's time, verification {verification:.0%}")
 
 
-def _views(image: np.ndarray, scales: tuple[float, ...]) -> list[np.ndarray]:
+def _views(image: np.ndarray, detector) -> list[np.ndarray]:
     height, width = image.shape
-    return [resize(image, round(scale * width), round(scale * height)) for scale in scales]
+    return [resize(image, round(scale * width), round(scale * height)) for scale in detector.view_scales(height, width)]
 
 
 @torch.inference_mode()

@@ -35,7 +35,7 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 @click.option(
     "--threshold",
     type=FINITE,
-    help="Least score of a detection. Default: set by the detector; 0.3 for shipped detectors.",
+    help="Least score of a detection. Default: set by the detector.",
 )
 @click.option(
     "--overlay",

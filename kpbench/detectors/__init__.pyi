@@ -1,3 +1,6 @@
+from .heads import Decoding as Decoding
+from .heads import decode as decode
+from .heads import keypoint_probability as keypoint_probability
 from .hypotheses import VerifiedCandidates as VerifiedCandidates
 from .interface import DETECTORS as DETECTORS
 from .interface import Detector as Detector
@@ -8,11 +11,8 @@ from .prediction import predict as predict
 from .prediction import predict_images as predict_images
 from .sources import has_other_designs as has_other_designs
 from .sources import open_source as open_source
-from .superpoint import Decoding as Decoding
 from .superpoint import SmallSuperPointDetector as SmallSuperPointDetector
 from .superpoint import SuperPointDetector as SuperPointDetector
-from .superpoint import decode as decode
-from .superpoint import keypoint_probability as keypoint_probability
 from .suppression import suppress as suppress
 from .template import TemplateDetector as TemplateDetector
 from .verification import verify_candidates as verify_candidates

@@ -23,14 +23,18 @@ from kpbench.types import Float, Float32, Int
 MERGE_DISTANCE = 0.2
 """Of two hypotheses of one design, the less likely is dropped if the centres are nearer than this, in short semi-axes
 of the likelier hypothesis."""
+UNUSED_COLUMNS = 4
+"""The second judge was trained on evidence with this many further columns, which compared a hypothesis with others
+elsewhere in the image. They are 0, as for the only patch of an image, so that a score depends on its surroundings."""
 
 
 class Evidence(IntEnum):
     """Columns of the evidence that a judge sees.
 
     The first judge sees the columns from ``NETWORK_SCORE`` to ``RADIUS``. The second judge, after the fit, sees all
-    columns. Logs are natural. Distances are in short semi-axes. Most formulas leave out the small constants that keep
-    the logs finite. The contrast is white - black.
+    columns, and ``UNUSED_COLUMNS`` columns of zeros. All evidence comes from the surroundings of the place. Logs are
+    natural. Distances are in short semi-axes. Most formulas leave out the small constants that keep the logs finite.
+    The contrast is white - black.
     """
 
     NETWORK_SCORE = 0
@@ -46,11 +50,11 @@ class Evidence(IntEnum):
     SHIFT = 5
     """Log of the distance from the candidate's place to the centre."""
     CONTRAST = 6
-    """log(contrast / 2 / range of the image's grey levels)."""
+    """log(contrast / 2 / range of the grey levels around the place)."""
     CONTRAST_TO_NOISE = 7
-    """log(contrast / 2 / noise of the image)."""
+    """log(contrast / 2 / noise around the place)."""
     RADIUS = 8
-    """Log of the short semi-axis, px."""
+    """Log of the short semi-axis, px of the picture in which the place was found."""
     FIT_NCC = 9
     """-log(1.01 - correlation of the fitted design with the image)."""
     FIT_UNEXPLAINED = 10
@@ -62,21 +66,13 @@ class Evidence(IntEnum):
     FIT_MOVE = 13
     """Log of the distance from the centre before the fit to the fitted centre."""
     FIT_CONTRAST = 14
-    """log(fitted contrast / range of the image's grey levels)."""
+    """log(fitted contrast / range of the grey levels around the place)."""
     FIT_CONTRAST_TO_NOISE = 15
-    """log(fitted contrast / noise of the image)."""
+    """log(fitted contrast / noise around the place)."""
     FIT_RADIUS = 16
-    """Log of the fitted short semi-axis, px."""
+    """Log of the fitted short semi-axis, px of the picture in which the place was found."""
     FIRST_JUDGE = 17
     """Log odds that the first judge gave."""
-    OTHER_PATCHES = 18
-    """Log of 1 + the expected number of right hypotheses elsewhere in the image."""
-    OTHER_ERRORS = 19
-    """Log of 1 + the expected number of wrong hypotheses elsewhere in the image."""
-    OTHER_BLUR = 20
-    """log(blur in px) minus its mean over the hypotheses elsewhere, shrunk towards 0 if few of these are likely."""
-    OTHER_CONTRAST = 21
-    """log(contrast) minus its mean over the hypotheses elsewhere, shrunk towards 0 if few of these are likely."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +85,10 @@ class Hypotheses:
         Index of the place among the candidates.
     place_xy : ndarray of shape (n, 2)
         Position of the place, px.
+    octave : ndarray of shape (n,), int64
+        Pyramid level of the picture in which the place was found.
+    noise, grey_range : ndarray of shape (n,)
+        Of the surroundings of the place, from :meth:`kpbench.fitting.pyramid.Pyramids.measure_surroundings`.
     design : ndarray of shape (n,), int64
         Index of the design.
     xy, A : ndarray of shape (n, 2) and (n, 2, 2)
@@ -105,6 +105,9 @@ class Hypotheses:
 
     place: Int
     place_xy: Float
+    octave: Int
+    noise: Float
+    grey_range: Float
     design: Int
     xy: Float
     A: Float

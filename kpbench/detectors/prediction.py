@@ -89,7 +89,8 @@ def predict(
         Detections with a lower score are dropped. A detector given by name gets this threshold in place of its own
         threshold. None keeps all detections.
     workers : int, optional
-        Number of processes; None for one per core. A loaded detector always runs in the calling process, and so does
+        Number of processes; None for one per core. The processes share the cores: each uses cores / workers threads, in
+        OpenCV, BLAS and torch. A loaded detector always runs in the calling process, and so does
         any detector on images without truth.
     overlay : Path, optional
         Folder or video file to draw the detections into.
@@ -130,7 +131,7 @@ def predict(
     names = [f"{image_id:08d}.png" for image_id in ids]
     pass_on = _pass_on(sink, loaded, dataset)
     with image_writer(overlay, count, names=names) as draw:
-        for results in run_jobs(work, pieces, workers, progress):
+        for results in run_jobs(work, pieces, workers, progress, share_cores=True):
             found.update(results)
             pass_on([*results.values()], [], ids[[*results]])
         for n in range(count) if overlay is not None else ():

@@ -2,8 +2,7 @@
 
 The network divides the image into cells of 8x8 px and has two heads. The detector head gives a logit for each pixel of
 a cell and for "no keypoint". The ID head gives a logit for each design and for "no patch", one set per cell.
-:func:`decode` turns the logits of the detector head into one probability map at full resolution. A keypoint is the
-centre of mass of the probability in a window around a local maximum. The window may cross the borders of cells.
+:mod:`kpbench.detectors.heads` decodes both.
 """
 
 from __future__ import annotations
@@ -13,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.detectors.heads import CELL_PX, Decoding, identify, locate
 from kpbench.detectors.hypotheses import clipped_semi_axis
 from kpbench.detectors.inference import open_session, runs_on_gpu, try_network
 from kpbench.detectors.suppression import suppress
@@ -27,171 +26,34 @@ from kpbench.images import resize, to_grey
 from kpbench.memory import require_memory
 from kpbench.patches.design import parse_patch
 from kpbench.toml import TomlTable, name_source
-from kpbench.types import Detections, Float, Float32, UInt8
+from kpbench.types import Detections, Float, Float32, Int, UInt8
 
-CELL_PX = 8
-"""Side of a cell, px."""
 SCHEMA = "kpbench.superpoint/1"
-MOST_PEAKS = 10_000
-"""Largest number of maxima of an image that are looked at, the best first. A trained network has a few hundred."""
+"""Schema of the metadata in the ONNX file."""
 MOST_DESIGNS = 256
 """Largest number of designs of a network."""
-"""Schema of the metadata in the ONNX file."""
-EMPTY_CELL_LOG_ODDS = float(np.log(2e-4))
-"""A cell is empty if log(p / q) is at most this for every pixel, where p is the probability of the pixel and q the
-probability of "no keypoint". Most cells are empty."""
 
-# Settings of the verified detector. CANDIDATE_SCORE, SCALES and VERIFIED_THRESHOLD were chosen on synthetic images with
-# training photographs as backgrounds. The measurements are in two sections of notebook/training-log.md:
-# - "Weaker places, longer ellipses, and judges on their poses"
-# - "Fewer looks, and what ten thousand more images were worth"
-# The source of MERGE_DISTANCE_PX and DISC_SHARE is not recorded.
+# Settings of the verified detector. The source of DISC_SHARE is not recorded. CANDIDATE_SCORE and the first scale were
+# chosen on synthetic images with training photographs as backgrounds, see notebook/training-log.md, "Weaker places,
+# longer ellipses, and judges on their poses".
 CANDIDATE_SCORE = 0.015
 """Least network score of a place that is verified."""
-SCALES = (1.2, 0.5, 0.25)
-"""Scales of the image that the network sees: enlarged for small patches, shrunk for large patches."""
-VERIFIED_THRESHOLD = 0.3
-"""Least score of a verified detection."""
-MERGE_DISTANCE_PX = 3.0
-"""If two candidates are nearer than this, px, only the better is kept, as two scales may find the same keypoint."""
+SCALES = (1.2, 0.5)
+"""Scales of the image that the network sees: enlarged for small patches, shrunk for large patches. The last scale is
+halved again and again as long as the shorter side of the picture keeps ``LEAST_SHORT_SIDE_PX``."""
+LEAST_SHORT_SIDE_PX = 50
+"""Length of the shorter side of the smallest picture that the network sees, px."""
+BYTES_PER_PIXEL = 25
+"""Memory that the detector needs per pixel of the largest picture, besides the network, bytes. Measured."""
+STRIP_PIXELS, STRIP_MARGIN_PX = 3_000_000, 64
+"""The network sees a picture with more pixels than ``STRIP_PIXELS`` in horizontal strips, which bounds the memory. Each
+strip overlaps the next by twice the margin. The outputs of the shipped networks do not depend on pixels that are
+further away than the margin."""
+VERIFIED_THRESHOLD = 0.5
+"""Least score of a verified detection. The rule: the least multiple of 0.1 with at most 0.05 false alarms per image
+on 600 deteriorated synthetic images over training photographs."""
 DISC_SHARE = 0.6
 """If two detections are nearer than this, in short semi-axes of the better detection, only the better is kept."""
-
-
-@dataclass(frozen=True)
-class Decoding:
-    """Settings of :func:`decode`.
-
-    Attributes
-    ----------
-    threshold : float
-        Least score of a keypoint: the probability that a keypoint lies in the window around the maximum, in [0, 1].
-        A threshold below 0.01 still misses some keypoints, as the pixels of empty cells count as 0.
-    separation_px : int
-        If two maxima are nearer than this, px, only the better is kept. With the default, the centres of two discs side
-        by side are both kept if the short axes of the discs are at least 10 px long.
-    window_px : int
-        Reach of the window around a maximum, px: the window is ``2 · window_px + 1`` px wide. The score is the sum of
-        the probability in the window. The place is the centre of mass of this probability.
-
-    Examples
-    --------
-    >>> from kpbench.detectors import Decoding
-    >>> Decoding(threshold=0.3).window_px
-    3
-    """
-
-    threshold: float = 0.5
-    separation_px: int = 6
-    window_px: int = 3
-
-
-def decode(detector_logits: Float32, id_logits: Float32, decoding: Decoding | None = None) -> Detections:
-    """Return the keypoints of one image from the logits of the network's two heads.
-
-    Parameters
-    ----------
-    detector_logits : ndarray of shape (65, h, w), float32
-        One channel per pixel of a cell, row by row, and a last channel for "no keypoint".
-    id_logits : ndarray of shape (ids + 1, h, w), float32
-        One channel per design, and a last channel for "no patch".
-    decoding : Decoding, optional
-        None: the defaults.
-
-    Returns
-    -------
-    Detections
-        ``xy`` in px of the (8h, 8w) image, best first. ``patch_id`` is the index of the ID head's likeliest design.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kpbench.detectors import decode
-    >>> detector_logits, id_logits = np.zeros((65, 4, 4), np.float32), np.zeros((5, 4, 4), np.float32)
-    >>> detector_logits[64] = 10                      # "no keypoint" in all cells ...
-    >>> detector_logits[8 * 5 + 3, 2, 1] = 30         # ... but at row 5, column 3 of the cell in row 2, column 1
-    >>> decode(detector_logits, id_logits).xy
-    array([[11., 21.]])
-    """
-    xy, score = locate(detector_logits, decoding or Decoding())
-    return Detections(xy, score, np.argmax(identify(id_logits, xy)[:, :-1], axis=1))
-
-
-def locate(detector_logits: Float32, decoding: Decoding) -> tuple[Float, Float]:
-    """Return places (n, 2) px and scores (n,) of keypoints from detector logits (65, h, w), best first."""
-    probability = keypoint_probability(detector_logits)
-    # a light smoothing removes small bumps, so that each blob has one maximum
-    ranked = cv2.GaussianBlur(probability, (5, 5), 1.0, borderType=cv2.BORDER_CONSTANT)
-    side = 2 * decoding.separation_px - 1
-    highest = cv2.dilate(ranked, np.ones((side, side), np.uint8))
-    width, offset = 2 * decoding.window_px + 1, np.arange(-decoding.window_px, decoding.window_px + 1)
-    # a window whose sum reaches the threshold has a pixel of at least threshold / width²; 0.5 allows for the smoothing
-    found = np.flatnonzero(ranked > 0.5 * decoding.threshold / width**2)  # many times faster than nonzero in 2-D
-    found = found[ranked.ravel()[found] >= highest.ravel()[found]]
-    rows, columns = np.divmod(found, probability.shape[1])
-    windows = _windows(probability, rows[:, None] + offset, columns[:, None] + offset)
-    total = windows.sum(axis=(1, 2))
-    likely = np.flatnonzero(total >= decoding.threshold)
-    likely = likely[np.argsort(-total[likely], kind="stable")[:MOST_PEAKS]] if len(likely) > MOST_PEAKS else likely
-    rows, columns, windows, total = rows[likely], columns[likely], windows[likely], total[likely]
-    x = columns + windows.sum(axis=1) @ offset / total
-    y = rows + windows.sum(axis=2) @ offset / total
-    xy = np.column_stack([x, y])
-    score = np.minimum(total, 1.0).astype(np.float64)
-    kept = suppress(xy, score, decoding.separation_px)
-    return xy[kept], score[kept]
-
-
-def _windows(image: Float32, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> Float32:
-    """Return windows (n, k, k) of an image at rows (n, k) and columns (n, k); 0 outside the image."""
-    height, width = image.shape
-    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[:, None]
-    part = image[np.clip(rows, 0, height - 1)[:, :, None], np.clip(columns, 0, width - 1)[:, None]]
-    return np.asarray(part * inside, np.float32)
-
-
-def identify(id_logits: Float32, xy: Float) -> Float:
-    """Return log probabilities (n, ids + 1) of each design and of "no patch" at places (n, 2) px."""
-    logits = _interpolate_cells(id_logits, xy)
-    logits = logits - logits.max(axis=1, keepdims=True)
-    return np.asarray(logits - np.log(np.exp(logits).sum(axis=1, keepdims=True)))
-
-
-def keypoint_probability(detector_logits: Float32) -> Float32:
-    """Return the probability (8h, 8w) of a keypoint at each pixel, from detector logits (65, h, w).
-
-    The probabilities of a cell are the softmax of its logits. All probabilities of an empty cell are set to 0.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kpbench.detectors import keypoint_probability
-    >>> keypoint_probability(np.zeros((65, 3, 4), np.float32)).shape
-    (24, 32)
-    """
-    _, h, w = detector_logits.shape
-    rows, columns = np.nonzero(detector_logits[:-1].max(axis=0) - detector_logits[-1] > EMPTY_CELL_LOG_ODDS)
-    logits = detector_logits[:, rows, columns]
-    share = np.exp(logits - logits.max(axis=0))
-    share = share[:-1] / share.sum(axis=0)
-    probability = np.zeros((h, CELL_PX, w, CELL_PX), np.float32)
-    probability[rows, :, columns] = share.T.reshape(-1, CELL_PX, CELL_PX)
-    return probability.reshape(CELL_PX * h, CELL_PX * w)
-
-
-def _interpolate_cells(cells: Float32, xy: Float) -> Float:
-    """Interpolate a map of cells (C, h, w) bilinearly at places (n, 2) px. Return the values (n, C).
-
-    Cell i is centred at 3.5 + 8i px.
-    """
-    _, h, w = cells.shape
-    u = np.clip((xy - (CELL_PX - 1) / 2) / CELL_PX, 0, (w - 1, h - 1))
-    low = np.minimum(u.astype(int), np.maximum((w - 2, h - 2), 0))
-    (fx, fy), (j, i) = (u - low).T, low.T
-    j1, i1 = np.minimum(j + 1, w - 1), np.minimum(i + 1, h - 1)
-    top = cells[:, i, j] * (1 - fx) + cells[:, i, j1] * fx
-    bottom = cells[:, i1, j] * (1 - fx) + cells[:, i1, j1] * fx
-    return np.asarray((top * (1 - fy) + bottom * fy).T)
 
 
 def _inside(xy: Float, image: UInt8) -> NDArray[np.bool_]:
@@ -215,15 +77,16 @@ class SuperPointDetector:
         ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, as 8-bit integers on a
         CPU and as float32 on a GPU.
     threshold : float, optional
-        Least score of a detection, in [0, 1]. None: 0.3 if candidates are verified, else 0.5.
+        Least score of a detection, in [0, 1]. None: 0.5.
     verified : bool
         Whether the candidates of the network are compared with the designs in the file. The verification then gives
         centre, identity and score. False: the network alone decides, at the image's own scale. A design without an
         edge at its centre cannot be verified; ``verified`` becomes False if the file has such a design.
     threads : int
         Threads of the networks. 0 means the number of OpenCV's threads.
-    scales : tuple of float
-        Scales of the image that the network sees, if candidates are verified.
+    scales : tuple of float, optional
+        Scales of the image that the network sees, if candidates are verified. None: 1.2 and 0.5, and the halves of the
+        last scale down to a picture with a shorter side of 50 px.
     shipped : str
         Name of the shipped weights, for ``path=None``.
 
@@ -247,11 +110,11 @@ class SuperPointDetector:
     threshold: float | None = None
     verified: bool = True
     threads: int = 0
-    scales: tuple[float, ...] = SCALES
+    scales: tuple[float, ...] | None = None
     shipped: ClassVar[str] = "superpoint"
 
     def __post_init__(self) -> None:
-        if not self.scales or not all(0 < scale <= 16 for scale in self.scales):
+        if self.scales is not None and not (self.scales and all(0 < scale <= 16 for scale in self.scales)):
             raise DataError(f"scales are {self.scales}, expected at least one, each over 0 and up to 16")
         ours = WEIGHTS / f"{self.shipped}{'' if runs_on_gpu() else '-int8'}.onnx"
         self.path = ours if self.path is None else Path(self.path)
@@ -282,18 +145,17 @@ class SuperPointDetector:
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
         self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
         if self.verified:
-            self.version += f"-{verifier_version(CANDIDATE_SCORE, self.scales)}"
+            self.version += f"-{verifier_version(CANDIDATE_SCORE, self.scales or (*SCALES, LEAST_SHORT_SIDE_PX))}"
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
 
     @property
     def _bytes_per_pixel(self) -> float:
-        """Memory that the network needs per pixel of an image, bytes. The factors are measured."""
+        """Memory that the network needs per pixel of a picture, bytes. The factors are measured."""
         try:
             channels = min(max(1, int(self.content["recipe"]["network"]["widths"][0])), 4096)
         except (LookupError, TypeError, ValueError, OverflowError):  # nobody checks this part of the metadata
             channels = 64
-        scale = max(self.scales) if self.verified else 1.0
-        return scale**2 * channels * (6.5 if "int8" in self.content else 10)
+        return channels * (6.5 if "int8" in self.content else 10)
 
     @property
     def _threshold(self) -> float:
@@ -317,7 +179,9 @@ class SuperPointDetector:
         greys = [to_grey(image) for image in images]
         for grey in greys[:1]:
             what = f"{self.name}: {len(greys)} image(s) of {grey.shape[1]} x {grey.shape[0]} pixels"
-            require_memory(int(self._bytes_per_pixel * grey.size * len(greys)), what)
+            pixels = max(self.view_scales(*grey.shape)) ** 2 * grey.size
+            needed = self._bytes_per_pixel * min(pixels, STRIP_PIXELS) + BYTES_PER_PIXEL * pixels
+            require_memory(int(needed * len(greys)), what)
         if len({grey.shape for grey in greys}) > 1:
             raise DataError(f"a batch needs images of one size, got {sorted({grey.shape for grey in greys})}")
         if not greys or not greys[0].size:
@@ -326,6 +190,18 @@ class SuperPointDetector:
 
     def heads(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         """Return the logits of the two heads, (B, 65, h, w) and (B, ids + 1, h, w), for B grey images of one size."""
+        height, width = pad_to_cells(greys[0]).shape
+        rows = max(1, STRIP_PIXELS // (width * CELL_PX)) * CELL_PX
+        if height <= rows:
+            return self._run_network(greys)
+        parts = []
+        for first in range(0, height, rows):
+            start = max(0, first - STRIP_MARGIN_PX)
+            outputs = self._run_network([grey[start : first + rows + STRIP_MARGIN_PX] for grey in greys])
+            parts.append([output[:, :, (first - start) // CELL_PX :][:, :, : rows // CELL_PX] for output in outputs])
+        return [np.concatenate(strips, axis=2) for strips in zip(*parts, strict=True)]
+
+    def _run_network(self, greys: Sequence[UInt8]) -> Sequence[Float32]:
         blob = np.float32(1 / 255) * np.stack([pad_to_cells(grey) for grey in greys])[:, None]
         try:
             outputs: list[Float32] = list(self._session.run(None, {"image": blob}))
@@ -338,19 +214,28 @@ class SuperPointDetector:
             raise DataError(f"{self.path}: the outputs have the shapes {shapes}, expected {expected[0]}, {expected[1]}")
         return outputs
 
-    def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float]]:
+    def view_scales(self, height: int, width: int) -> tuple[float, ...]:
+        """Return the scales at which the network sees an image of ``height`` x ``width`` px."""
+        if not self.verified:
+            return (1.0,)
+        if self.scales is not None:
+            return self.scales
+        octaves = int(max(0, np.log2(SCALES[-1] * min(height, width) / LEAST_SHORT_SIDE_PX)))
+        return *SCALES, *(SCALES[-1] * 0.5**n for n in range(1, octaves + 1))
+
+    def candidates(self, greys: Sequence[UInt8]) -> list[tuple[Float, Float, Float, Int]]:
         """Return the candidates of the network, for each of several grey images of one size.
 
         Returns
         -------
         list of tuple
-            Per image: places (n, 2) px, best first; their scores (n,); and log probabilities (n, ids + 1) of each
-            design and of no patch.
+            Per image: places (n, 2) px; their scores (n,); log probabilities (n, ids + 1) of each design and of no
+            patch; and the pyramid levels (n,) of the pictures in which they were found.
         """
         decoding = Decoding(CANDIDATE_SCORE if self.verified else self._threshold)
         height, width = greys[0].shape
-        found: list[list[tuple[Float, Float, Float]]] = [[] for _ in greys]
-        for scale in self.scales if self.verified else (1.0,):
+        found: list[list[tuple[Float, Float, Float, Int]]] = [[] for _ in greys]
+        for scale in self.view_scales(height, width):
             size = max(1, round(scale * width)), max(1, round(scale * height))
             exact_scale = np.divide(size, (width, height))  # differs from ``scale`` by the rounding to whole px
             heads = self.heads([resize(grey, *size) for grey in greys])
@@ -358,16 +243,15 @@ class SuperPointDetector:
                 scaled_xy, score = locate(detector, decoding)
                 xy = (scaled_xy + 0.5) / exact_scale - 0.5
                 inside = _inside(xy, greys[0])
-                parts.append((xy[inside], score[inside], identify(ids, scaled_xy[inside])))
-        columns = [[np.concatenate(column) for column in zip(*parts, strict=True)] for parts in found]
-        kept = [suppress(xy, score, MERGE_DISTANCE_PX) for xy, score, _ in columns]
-        return [(xy[k], score[k], log_id[k]) for (xy, score, log_id), k in zip(columns, kept, strict=True)]
+                octave = np.full(np.count_nonzero(inside), max(0, round(-np.log2(scale))))
+                parts.append((xy[inside], score[inside], identify(ids, scaled_xy[inside]), octave))
+        return [tuple(map(np.concatenate, zip(*parts, strict=True))) for parts in found]  # type: ignore[misc]
 
-    def _decide(self, grey: UInt8, xy: Float, score: Float, log_id: Float) -> Detections:
+    def _decide(self, grey: UInt8, xy: Float, score: Float, log_id: Float, octave: Int) -> Detections:
         """Return the detections among the candidates of one image."""
         if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
-        found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads)
+        found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads, octave)
         likely = np.flatnonzero((found.score >= self._threshold) & _inside(found.xy, grey))
         xy, score, reach = found.xy[likely], found.score[likely], DISC_SHARE * clipped_semi_axis(found.A[likely])
         kept = suppress(xy, score, np.maximum(Decoding.separation_px, reach))

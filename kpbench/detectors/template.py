@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from kpbench.errors import DataError
 from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, short_semi_axis
 from kpbench.fitting.design_fit import Fit, fit
-from kpbench.fitting.pyramid import Pyramids
+from kpbench.fitting.pyramid import Pyramids, choose_level
 from kpbench.fitting.sector_search import CORE_RADIUS_PX, core_symmetries, estimate_size, search_sectors
 from kpbench.fitting.templates import build_templates
 from kpbench.images import to_grey
@@ -35,7 +35,11 @@ from kpbench.workers import one_blas_thread
 
 TEMPLATE_BYTES_PER_PIXEL = 80
 """Memory that the detector needs per pixel of the image, bytes. Measured on images of 8 megapixels."""
-VERSION = "1"
+DRAWN_RADIUS_PX = 20
+"""Radius of the drawing in which the detector has to find each design, px."""
+SURROUNDED_PX = 24.0
+"""Noise and grey range are measured in the coarsest level in which the short semi-axis is at least this many px."""
+VERSION = "2"
 """Version of the method. Raise the version by one when detections change."""
 
 
@@ -114,11 +118,11 @@ class ScoreWeights:
         Weights of log(1.01 − correlation), for the correlations of the core and of the whole design.
     unexplained : float
         Weight of log(√(residual² − noise²) / contrast + 0.02), with the standard deviations of the fit's residuals and
-        of the image's noise.
+        of the noise around the candidate.
     blur : float
         Weight of the blur, in short semi-axes.
     contrast : float
-        Weight of log(contrast / (range + 5)), with the range of the image's grey levels.
+        Weight of log(contrast / (range + 5)), with the range of the grey levels around the candidate.
     """
 
     offset: float = -12.55
@@ -191,18 +195,16 @@ class Candidates:
     core_ncc, whole_ncc : ndarray of shape (n,)
         Correlations of the core and of the whole design with the image, before the fit.
     fit : Fit
-    noise : float
-        Standard deviation of the image's noise, grey levels.
-    grey_range : float
-        Difference between the bright and the dark parts of the image, grey levels.
+    noise, grey_range : ndarray of shape (n,)
+        Of the surroundings, from :meth:`kpbench.fitting.pyramid.Pyramids.measure_surroundings`.
     """
 
     design: Int
     core_ncc: Float
     whole_ncc: Float
     fit: Fit
-    noise: float
-    grey_range: float
+    noise: Float
+    grey_range: Float
 
     @property
     def score(self) -> Float:
@@ -236,7 +238,8 @@ class TemplateDetector:
     Raises
     ------
     DataError
-        If a design has no edges of two directions that meet at its centre.
+        If a design has no edges of two directions that meet at its centre, or the detector does not find a design in a
+        clean drawing of it.
 
     Examples
     --------
@@ -258,11 +261,28 @@ class TemplateDetector:
     version: str = VERSION
 
     def __post_init__(self) -> None:
-        for patch in self.patches:
+        for n, patch in enumerate(self.patches):
             if not patch.centre_is_crossing:
                 raise DataError(
                     f"design {patch.name!r}: template needs edges of two directions that meet at the centre"
                 )
+            if patch not in shipped_patches() and not self._sees(n):
+                raise DataError(
+                    f"design {patch.name!r}: template does not find it in its own drawing with a radius of "
+                    f"{DRAWN_RADIUS_PX} px, expected a design with wider sectors"
+                )
+
+    def _sees(self, n: int) -> bool:
+        """Return whether the detector finds a design in a clean drawing; ``n`` is the index of the design."""
+        patch = self.patches[n]
+        side = int(2.6 * patch.extent * DRAWN_RADIUS_PX)
+        v, u = (np.mgrid[:side, :side] - (side - 1) / 2) / DRAWN_RADIUS_PX
+        black = patch.is_black(np.stack([u, v], axis=-1))
+        with one_blas_thread():
+            found = self.candidates(
+                np.where(np.hypot(u, v) > patch.extent, 128, np.where(black, 0, 255)).astype(np.uint8)
+            )
+        return bool(np.any((found.design == n) & (found.score >= TemplateDetector.threshold)))
 
     def __call__(self, image: UInt8) -> Detections:
         """Return the detections in one image, uint8 (H, W) or RGB (H, W, 3), best first."""
@@ -301,7 +321,9 @@ class TemplateDetector:
         alike = SCORE_WEIGHTS.likeness(core.ncc, whole.ncc) > TEMPLATE_THRESHOLDS.likeness
         core, whole = core[alike], whole[alike]
         fits = fit(raw, whole.xy, whole.A, [self.patches[n] for n in whole.design])
-        return Candidates(whole.design, core.ncc, whole.ncc, fits, pyramids.noise, pyramids.grey_range)
+        level = choose_level(short_semi_axis(whole.A), SURROUNDED_PX, raw)
+        noise, grey_range = pyramids.measure_surroundings(whole.xy, level)
+        return Candidates(whole.design, core.ncc, whole.ncc, fits, noise, grey_range)
 
 
 def _find_places(image: Float32, smooth: list[Float32]) -> tuple[Float, Int]:

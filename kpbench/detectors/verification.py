@@ -7,16 +7,20 @@ verification works in five steps.
 1. Ellipses (:func:`find_ellipses`). A small network, the ellipse network, sees the surroundings of each place. The
    ellipse network gives the ellipse that a patch at this place would fill, and the log odds that the place lies on a
    patch.
-2. Poses (:func:`propose_poses`). The likely designs are rotated within the ellipse until they agree best with the
-   image. A place with a design and a pose is a hypothesis.
+2. Poses (:func:`propose_poses`). All designs are rotated within the ellipse. The two poses that agree best with the
+   image are kept. A place with a design and a pose is a hypothesis.
 3. First judge (:func:`judge`). A small network sees each hypothesis: the image in the frame of the patch, the design,
    and measured :class:`~kpbench.detectors.hypotheses.Evidence`. The judge gives the log odds that the hypothesis is
    right, and corrects the pose. Likely hypotheses are measured again in the corrected pose (:func:`look_again`), and
    the first judge sees them a second time.
 4. Fit (:func:`fit_hypotheses`). The design is fitted to the pixels (:func:`kpbench.fitting.fit`).
-5. Second judge (:func:`judge`). Another small network sees the fitted hypothesis. The patches of an image have similar
-   blur and contrast, so the evidence now also compares the hypothesis with the other likely hypotheses of the image.
-   The log odds of the second judge give the score of the detection.
+5. Second judge (:func:`judge`). Another small network sees the fitted hypothesis. Its log odds give the score of the
+   detection.
+
+The networks were trained on patches with a radius of about 5 to 50 px. So that a patch may have any size, they see a
+place in the picture in which it was found, a level of the image's pyramid; sizes in the evidence are px of this level.
+Places, poses and fits are px of the image. Noise and grey range are measured around each place, so that a score does
+not depend on the rest of the image.
 
 :mod:`kpbench.training.verifier` trains the ellipse network and the two judges on synthetic images.
 """
@@ -33,6 +37,7 @@ import cv2
 import numpy as np
 
 from kpbench.detectors.hypotheses import (
+    UNUSED_COLUMNS,
     Evidence,
     Hypotheses,
     VerifiedCandidates,
@@ -44,32 +49,23 @@ from kpbench.detectors.hypotheses import (
 from kpbench.detectors.inference import InferenceSession, open_session
 from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, rotate_within_ellipse
 from kpbench.fitting.covariance import start_covariance
-from kpbench.fitting.design_fit import fit
-from kpbench.fitting.pyramid import Pyramids
+from kpbench.fitting.design_fit import FINE_PX, fit
+from kpbench.fitting.pyramid import SURROUNDINGS_PX, Pyramids
 from kpbench.fitting.templates import DesignTemplates, build_templates
 from kpbench.fitting.views import rectify, sample_surroundings
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
-VERIFIER = "8"
+VERIFIER = "9"
 """Version of the method. Raise the version by one when detections change for any reason other than new weights."""
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped networks."""
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
 """Names of the networks, without ``.onnx``."""
 
-# The limits were chosen on synthetic images with training photographs as backgrounds. Most of the measurements are in
-# two sections of notebook/training-log.md:
-# - "Specks, sizes, and how many places an image has"
-# - "Fewer looks, and what ten thousand more images were worth"
-ID_MARGIN = 3.0
-"""A design is tried if its log probability, by the ID head, is at most this much below the likeliest design's."""
-ALL_DESIGNS_LOG_ODDS = 0.0
-"""At a place with at least these log odds from the ellipse network, all designs are tried."""
-THOROUGH_LOG_ODDS = -4.8
-"""At a place with at least these log odds from the ellipse network, ellipses of other sizes are tried, and a design may
-keep two rotations."""
+# The limits were chosen on synthetic images over training photographs: notebook/training-log.md, "Specks, sizes, and
+# how many places an image has" and "Fewer looks, and what ten thousand more images were worth".
 LEAST_ELLIPSE_LOG_ODDS = -6.5
 """A place with lower log odds from the ellipse network is dropped."""
 SECOND_LOOK_LOG_ODDS = -5.0
@@ -79,9 +75,9 @@ LEAST_FIT_LOG_ODDS = -3.5
 LARGEST_FIT_MOVE = 0.1
 """If a fit moves the centre further than this, in short semi-axes, the pose before the fit is kept. After such a move,
 the pose before the fit is right more often."""
-USUAL_PLACES = 70
-"""Number of candidates in a typical training image of 640x480 px. If an image has n > USUAL_PLACES candidates,
-log(n / USUAL_PLACES) is subtracted from the second judge's log odds."""
+USUAL_PLACES = 8.4
+"""Number of candidates in a square of ``SURROUNDINGS_PX`` of a typical training image, which had 70 in 640x480 px.
+Among n > USUAL_PLACES candidates, log(n / USUAL_PLACES) is subtracted from the second judge's log odds."""
 LEAST_SEMI_AXIS_PX = 2.4
 """Short semi-axis of the smallest patch that is reported, px. Smaller patches cannot be told from specks."""
 LEAST_CONTRAST = 2.0
@@ -90,12 +86,18 @@ LEAST_CONTRAST = 2.0
 - Before the fit, a hypothesis is dropped if (white - black) / 2 is at most the limit.
 - In the evidence of the fit, a lower contrast white - black is raised to the limit.
 """
-PLACES_PER_BLOCK = 2**11
-"""Largest number of places that the ellipse network sees in one call. This limits the memory use."""
+PLACES_PER_BLOCK = 2**10
+"""Largest number of places or hypotheses that a network sees in one call. This limits the memory use."""
 
 
 def verify_candidates(
-    grey: UInt8, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
+    grey: UInt8,
+    xy: Float,
+    network_score: Float,
+    log_id: Float,
+    patches: Sequence[Patch],
+    threads: int = 0,
+    octave: Int | None = None,
 ) -> VerifiedCandidates:
     """Compare candidates with the likely designs, and fit the candidates that look like a patch.
 
@@ -112,6 +114,9 @@ def verify_candidates(
         The designs.
     threads : int
         Threads of the ellipse network and the judges. 0 means the number of OpenCV's threads.
+    octave : ndarray of shape (n,), int64, optional
+        Pyramid level of the picture in which each candidate was found: 1 if the picture had half the size of the image.
+        The networks see the candidate in this picture. None: all were found in the image itself.
 
     Returns
     -------
@@ -133,24 +138,31 @@ def verify_candidates(
     """
     pyramids = Pyramids(grey)
     with one_blas_thread():
-        proposed = propose_poses(pyramids, xy, network_score, log_id, patches, threads)
+        proposed = propose_poses(pyramids, xy, network_score, log_id, patches, threads, octave)
         log_odds, corrected = judge(FIRST_JUDGE, proposed, patches, threads)
         shown_again = look_again(pyramids, corrected[log_odds >= SECOND_LOOK_LOG_ODDS], patches)
         log_odds, corrected = judge(FIRST_JUDGE, shown_again, patches, threads)
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
-    # more candidates than usual do not mean more patches, so each candidate is less likely to lie on a patch
-    log_odds = log_odds - np.log(max(1.0, len(xy) / USUAL_PLACES))
+    near = _count_near(fitted, xy, np.zeros(len(xy), np.int64) if octave is None else octave)
+    log_odds = log_odds - np.log(np.maximum(1.0, near / USUAL_PLACES))  # more candidates do not mean more patches
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
-    found, log_odds = fitted[best], log_odds[best]
-    score = 1 / (1 + np.exp(-log_odds))
-    fitted_pose = found.xy, found.A, found.covariance, found.blur_px
-    return VerifiedCandidates(found.place, found.design, *fitted_pose, score)
+    found, score = fitted[best], 1 / (1 + np.exp(-log_odds[best]))
+    return VerifiedCandidates(found.place, found.design, found.xy, found.A, found.covariance, found.blur_px, score)
 
 
-def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Float, Float, Float]:
+def _count_near(hypotheses: Hypotheses, xy: Float, octave: Int) -> Int:
+    """Return the number (n,) of candidates, of equal or coarser pictures, in the square around each hypothesis."""
+    distance = np.abs(hypotheses.place_xy[:, None] - xy).max(axis=2) * 0.5 ** hypotheses.octave[:, None]
+    near = (distance < SURROUNDINGS_PX / 2) & (octave >= hypotheses.octave[:, None])
+    return np.asarray(np.count_nonzero(near, axis=1))
+
+
+def find_ellipses(
+    pyramids: Pyramids, xy: Float, threads: int = 0, octave: Int | None = None
+) -> tuple[Float, Float, Float]:
     """Find the ellipse that a patch at each place would fill.
 
     Parameters
@@ -158,7 +170,7 @@ def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Floa
     pyramids : Pyramids
     xy : ndarray of shape (n, 2)
         Places, px. The network was trained on places within about half a short semi-axis of a centre.
-    threads : int
+    threads, octave
         As for :func:`verify_candidates`.
 
     Returns
@@ -171,11 +183,13 @@ def find_ellipses(pyramids: Pyramids, xy: Float, threads: int = 0) -> tuple[Floa
         Log odds that the place lies on a patch.
     """
     parts = [(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0))]
-    for block in np.split(xy, range(PLACES_PER_BLOCK, len(xy), PLACES_PER_BLOCK)) if len(xy) else ():
-        given = {"surroundings": sample_surroundings(pyramids.smooth, block)}
+    octave = np.zeros(len(xy), np.int64) if octave is None else octave
+    for first in range(0, len(xy), PLACES_PER_BLOCK):
+        block = np.s_[first : first + PLACES_PER_BLOCK]
+        given = {"surroundings": sample_surroundings(pyramids.smooth, xy[block], octave=octave[block])}
         log_odds, shift, log_map = _session(ELLIPSE, threads).run(None, given)
-        one_to_one = np.tile(np.eye(2), (len(block), 1, 1))
-        parts.append((*move_poses(block, one_to_one, shift, log_map), _clip_log_odds(log_odds)))
+        of_octave = np.eye(2) * 2.0 ** octave[block, None, None]
+        parts.append((*move_poses(xy[block], of_octave, shift, log_map), _clip_log_odds(log_odds)))
     centre, A, every_log_odds = (np.concatenate(column) for column in zip(*parts, strict=True))
     return centre, A, every_log_odds
 
@@ -206,29 +220,37 @@ def _clip_log_odds(log_odds: Float32) -> Float:
 
 
 def propose_poses(
-    pyramids: Pyramids, xy: Float, network_score: Float, log_id: Float, patches: Sequence[Patch], threads: int = 0
+    pyramids: Pyramids,
+    xy: Float,
+    network_score: Float,
+    log_id: Float,
+    patches: Sequence[Patch],
+    threads: int = 0,
+    octave: Int | None = None,
 ) -> Hypotheses:
-    """Return hypotheses: poses of the likely designs at every place that may lie on a patch.
+    """Return hypotheses: the best two poses at every place that may lie on a patch.
 
     The parameters are described at :func:`verify_candidates`.
     """
+    octave = np.zeros(len(xy), np.int64) if octave is None else np.minimum(octave, len(pyramids.raw) - 1)
+    centre, A, log_odds = find_ellipses(pyramids, xy, threads, octave)
+    likely = np.flatnonzero(log_odds >= LEAST_ELLIPSE_LOG_ODDS)
+    noise, grey_range = pyramids.measure_surroundings(xy[likely], octave[likely])
     templates = build_templates(patches)
-    centre, A, log_odds = find_ellipses(pyramids, xy, threads)
-    likely = log_id[:, :-1] >= log_id[:, :-1].max(axis=1, keepdims=True) - ID_MARGIN
-    tried = (likely | (log_odds >= ALL_DESIGNS_LOG_ODDS)[:, None]) & (log_odds >= LEAST_ELLIPSE_LOG_ODDS)[:, None]
-    place, design = np.nonzero(tried)
-    thorough = (log_odds >= THOROUGH_LOG_ODDS)[place]
-    row, poses = rotate_within_ellipse(pyramids.smooth, centre[place], A[place], design, templates, thorough)
-    place, design = place[row], design[row]
+    row, poses = rotate_within_ellipse(pyramids.smooth, centre[likely], A[likely], templates)
+    place, nothing = likely[row], np.zeros((len(row), 0), np.float32)
     of_networks = np.column_stack(
         [
             _log_odds(network_score[place]),
             np.log(np.maximum(1 - np.exp(log_id[place, -1]), 1e-4)),
-            log_id[place, design],
+            log_id[place, poses.design],
             log_odds[place],
         ]
     )
-    return _measure(pyramids, place, xy[place], poses, of_networks, templates)
+    of_place = place, xy[place], octave[place], noise[row], grey_range[row]
+    pose = poses.xy, poses.A, start_covariance(poses.A)
+    unseen = Hypotheses(*of_place, poses.design, *pose, nothing, np.zeros(len(row)), of_networks)
+    return _measure(pyramids, unseen, poses.ncc, templates)
 
 
 def look_again(pyramids: Pyramids, corrected: Hypotheses, patches: Sequence[Patch]) -> Hypotheses:
@@ -239,29 +261,26 @@ def look_again(pyramids: Pyramids, corrected: Hypotheses, patches: Sequence[Patc
     templates = build_templates(patches)
     poses = Poses(corrected.xy, corrected.A, corrected.design, np.zeros(len(corrected)))
     poses = align_poses(pyramids.smooth, poses, templates.whole, 0, WHOLE_RADIUS_PX)
-    of_networks = corrected.evidence[:, : Evidence.NCC]
-    return _measure(pyramids, corrected.place, corrected.place_xy, poses, of_networks, templates)
+    return _measure(pyramids, corrected, poses.ncc, templates)
 
 
-def _measure(
-    pyramids: Pyramids, place: Int, place_xy: Float, poses: Poses, of_networks: Float, templates: DesignTemplates
-) -> Hypotheses:
-    """Turn poses into hypotheses by measuring their views and evidence. Hypotheses of low contrast are left out.
+def _measure(pyramids: Pyramids, hypotheses: Hypotheses, ncc: Float, templates: DesignTemplates) -> Hypotheses:
+    """Measure the views of hypotheses, and the evidence from ``Evidence.NCC`` to ``Evidence.RADIUS``.
 
-    ``of_networks`` (n, 4) holds the evidence from the networks, which are the columns before ``Evidence.NCC``.
+    ``ncc`` (n,) holds the correlations of the designs with the image. Hypotheses of low contrast are left out.
     """
-    view, half_contrast = rectify(pyramids.smooth, poses.xy, poses.A, poses.design, templates)
-    minor = clipped_semi_axis(poses.A)
+    xy, A = hypotheses.xy, hypotheses.A
+    view, half_contrast = rectify(pyramids.smooth, xy, A, hypotheses.design, templates)
+    minor = clipped_semi_axis(A)
     measured = [
-        -np.log(1.01 - poses.ncc),
-        np.log(np.linalg.norm(poses.xy - place_xy, axis=1) / minor + 0.02),
-        *_contrast_evidence(half_contrast, pyramids),
-        np.log(minor),
+        -np.log(1.01 - ncc),
+        np.log(np.linalg.norm(xy - hypotheses.place_xy, axis=1) / minor + 0.02),
+        *_contrast_evidence(half_contrast, hypotheses),
+        np.log(minor * 0.5**hypotheses.octave),
     ]
-    evidence = np.column_stack([of_networks, *measured])
-    pose = poses.xy, poses.A, start_covariance(poses.A)
-    found = Hypotheses(place, place_xy, poses.design, *pose, view, np.zeros(len(place)), evidence)
-    return found[half_contrast > LEAST_CONTRAST]
+    evidence = np.column_stack([hypotheses.evidence[:, : Evidence.NCC], *measured])
+    measured_again = replace(hypotheses, covariance=start_covariance(A), view=view, evidence=evidence)
+    return measured_again[half_contrast > LEAST_CONTRAST]
 
 
 def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patches: Sequence[Patch]) -> Hypotheses:
@@ -270,10 +289,12 @@ def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patc
     The returned hypotheses have the fitted poses. A hypothesis keeps its pose if the fit moved the centre further than
     ``LARGEST_FIT_MOVE``. ``log_odds`` (n,) come from the first judge.
     """
-    fits = fit(pyramids.raw, before.xy, before.A, [patches[n] for n in before.design])
+    designs = [patches[n] for n in before.design]
+    fits = fit(pyramids.raw, before.xy, before.A, designs)
     contrast, minor = np.maximum(fits.white - fits.black, LEAST_CONTRAST), clipped_semi_axis(fits.A)
     shift, move = (np.linalg.norm(fits.xy - start, axis=1) / minor for start in (before.place_xy, before.xy))
-    unexplained = np.minimum(np.sqrt(np.maximum(fits.noise**2 - pyramids.noise**2, 0)) / contrast, 3.0)
+    noise, _ = pyramids.measure_surroundings(before.place_xy, _fit_level(before.A, designs, len(pyramids.raw)))
+    unexplained = np.minimum(np.sqrt(np.maximum(fits.noise**2 - noise**2, 0)) / contrast, 3.0)
     measured = np.column_stack(
         [
             -np.log(1.01 - fits.ncc),
@@ -281,47 +302,24 @@ def fit_hypotheses(pyramids: Pyramids, before: Hypotheses, log_odds: Float, patc
             np.minimum(fits.blur_px / minor, 1.0),
             np.log(shift + 0.02),
             np.log(move + 0.02),
-            *_contrast_evidence(contrast, pyramids),
-            np.log(minor),
+            *_contrast_evidence(contrast, before),
+            np.log(minor * 0.5**before.octave),
             log_odds,
+            *np.zeros((UNUSED_COLUMNS, len(before))),
         ]
     )
     far = move > LARGEST_FIT_MOVE
     xy, A = np.where(far[:, None], before.xy, fits.xy), np.where(far[:, None, None], before.A, fits.A)
     covariance = np.where(far[:, None, None], start_covariance(before.A), fits.covariance)
     view, _ = rectify(pyramids.smooth, xy, A, before.design, build_templates(patches))
-    shared = np.column_stack([np.log(fits.blur_px + 0.3), np.log(contrast)])
-    evidence = np.column_stack([before.evidence, measured, _compare_with_others(xy, minor, log_odds, shared)])
-    return Hypotheses(before.place, before.place_xy, before.design, xy, A, covariance, view, fits.blur_px, evidence)
+    evidence = np.column_stack([before.evidence, measured])
+    return replace(before, xy=xy, A=A, covariance=covariance, view=view, blur_px=fits.blur_px, evidence=evidence)
 
 
-def _compare_with_others(xy: Float, minor_px: Float, log_odds: Float, shared: Float) -> Float:
-    """Compare each hypothesis with the hypotheses elsewhere in the image.
-
-    Hypothesis b is elsewhere, seen from hypothesis a, if the distance of the centres is larger than the short semi-axis
-    of a. Let p be the probability, by the first judge, that a hypothesis is right.
-
-    Parameters
-    ----------
-    xy, minor_px, log_odds : ndarray of shape (n, 2), (n,) and (n,)
-        Centres and short semi-axes, px, and log odds by the first judge.
-    shared : ndarray of shape (n, k)
-        Measures that the patches of an image have in common.
-
-    Returns
-    -------
-    ndarray of shape (n, 2 + k)
-        Column 0 is log(1 + R), where R is the sum of p over the hypotheses elsewhere. Column 1 is log(1 + W), where W
-        is the sum of 1 - p over the hypotheses elsewhere. Column 2 + j is R / (R + 0.3) · (s - m), where s is column j
-        of ``shared``, and m is the mean of s over the hypotheses elsewhere, weighted by p. The factor R / (R + 0.3) is
-        near 0 if few right hypotheses are expected elsewhere.
-    """
-    right = 1 / (1 + np.exp(-log_odds))
-    elsewhere = np.linalg.norm(xy[:, None] - xy, axis=2) > minor_px[:, None]
-    patches, errors = elsewhere @ right, elsewhere @ (1 - right)
-    weight = elsewhere * right / (patches + 0.3)[:, None]
-    difference = shared * weight.sum(axis=1, keepdims=True) - weight @ shared
-    return np.column_stack([np.log1p(patches), np.log1p(errors), difference])
+def _fit_level(A: Float, designs: Sequence[Patch], levels: int) -> Int:
+    """Return the pyramid levels (n,) in which the last steps of the fits are taken."""
+    size = np.linalg.norm(A, 2, axis=(1, 2)) * [patch.extent for patch in designs] if len(A) else np.zeros(0)
+    return np.clip(np.ceil(np.log2(np.maximum(size, 1e-6) / FINE_PX)), 0, levels - 1).astype(np.int64)
 
 
 def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
@@ -336,7 +334,9 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
     """
     if not len(hypotheses):
         return np.zeros(0), hypotheses
-    log_odds, shift, log_map = _session(network, threads).run(None, judge_inputs(hypotheses, patches))
+    blocks = (hypotheses[n : n + PLACES_PER_BLOCK] for n in range(0, len(hypotheses), PLACES_PER_BLOCK))
+    parts = [_session(network, threads).run(None, judge_inputs(block, patches)) for block in blocks]
+    log_odds, shift, log_map = (np.concatenate(column) for column in zip(*parts, strict=True))
     xy, A = move_poses(hypotheses.xy, hypotheses.A, shift, log_map)
     return _clip_log_odds(log_odds), replace(hypotheses, xy=xy, A=A)
 
@@ -360,9 +360,9 @@ def _open(network: str, threads: int) -> InferenceSession:
     return open_session((WEIGHTS / f"{network}.onnx").read_bytes(), threads)[0]
 
 
-def _contrast_evidence(contrast: Float, pyramids: Pyramids) -> list[Float]:
-    """Return log(contrast / (grey range + 5)) and log(contrast / (noise + 1)) for contrasts (n,) in one image."""
-    return [np.log(contrast / (pyramids.grey_range + 5)), np.log(contrast / (pyramids.noise + 1))]
+def _contrast_evidence(contrast: Float, hypotheses: Hypotheses) -> list[Float]:
+    """Return log(contrast / (grey range + 5)) and log(contrast / (noise + 1)) for contrasts (n,)."""
+    return [np.log(contrast / (hypotheses.grey_range + 5)), np.log(contrast / (hypotheses.noise + 1))]
 
 
 def _log_odds(probability: Float) -> Float:

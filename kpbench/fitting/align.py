@@ -24,13 +24,10 @@ from kpbench.fitting.pyramid import (
 from kpbench.fitting.templates import DesignTemplates, Templates
 from kpbench.types import Float, Float32, Int
 
-AMBIGUOUS_NCC = 0.15
-"""A second rotation is kept if its correlation with the image is less than this below the best correlation."""
 DISTINCT_NCC = 0.5
 """Two rotations of a design are distinct if their templates correlate by less than this."""
-RADIUS_FACTORS = (0.8, 0.9, 1.1)
-"""Factors by which the given size of an ellipse is multiplied. Each product is tried besides the given size. Rings or
-the ground may have biased the given size."""
+SIZE_FACTORS = (1.0, 0.8, 0.9, 1.1)
+"""Factors by which the given size of an ellipse is multiplied. Rings or the ground may have biased the given size."""
 WHOLE_RADIUS_PX = 5.6
 """A whole design is compared in the coarsest pyramid level in which its short semi-axis is at least this many px."""
 LARGEST_STEP = 0.35
@@ -77,14 +74,11 @@ def short_semi_axis(A: Float) -> Float:
 
 
 def rotate_within_ellipse(
-    levels: Sequence[Float32],
-    xy: Float,
-    A: Float,
-    design: Int,
-    templates: DesignTemplates,
-    thorough: NDArray[np.bool_] | None = None,
+    levels: Sequence[Float32], xy: Float, A: Float, templates: DesignTemplates
 ) -> tuple[Int, Poses]:
-    """Find the rotation of a design within an ellipse, and a second rotation if its correlation is nearly as high.
+    """Find the two designs and rotations within an ellipse that agree best with the image.
+
+    The second pose has another design or a distinct rotation, see ``DISTINCT_NCC``.
 
     Parameters
     ----------
@@ -92,11 +86,7 @@ def rotate_within_ellipse(
         From :func:`kpbench.fitting.pyramid.build_pyramid`.
     xy, A : ndarray of shape (N, 2) and (N, 2, 2)
         Ellipses, px: the images of the unit circle.
-    design : ndarray of shape (N,), int64
-        Index of the design that is rotated.
     templates : DesignTemplates
-    thorough : ndarray of shape (N,), bool, optional
-        Ellipses for which other sizes are tried and a second rotation may be kept. None: all ellipses.
 
     Returns
     -------
@@ -106,31 +96,26 @@ def rotate_within_ellipse(
         M poses.
     """
     whole = templates.whole
-    extra = np.arange(len(xy)) if thorough is None else np.flatnonzero(thorough)
-    ncc, sized = _correlate_rotations(levels, xy, A, design, whole), A.copy()
-    for factor in RADIUS_FACTORS:
-        other = _correlate_rotations(levels, xy[extra], factor * A[extra], design[extra], whole)
-        better = other.max(axis=1) > ncc[extra].max(axis=1)
-        ncc[extra[better]], sized[extra[better]] = other[better], factor * A[extra[better]]
+    by_size = np.stack([_correlate_rotations(levels, xy, factor * A, whole) for factor in SIZE_FACTORS])
+    ncc, size = by_size.max(axis=0), np.array(SIZE_FACTORS)[by_size.argmax(axis=0)]
     first, every = ncc.argmax(axis=1), np.arange(len(xy))
-    distinct = whole.rotated @ whole.rotated.T < DISTINCT_NCC
-    second = np.where(distinct[first], ncc, -np.inf).argmax(axis=1)
-    ambiguous = distinct[first, second] & (ncc[every, second] > ncc[every, first] - AMBIGUOUS_NCC)
-    extra = extra[ambiguous[extra]]
-    row = np.concatenate([every, extra])
+    other = (whole.rotated @ whole.rotated.T < DISTINCT_NCC) | (whole.rotated_design[:, None] != whole.rotated_design)
+    second = np.where(other[first], ncc, -np.inf).argmax(axis=1)
+    is_other = other[first, second]
+    row = np.concatenate([every, every[is_other]])
     order = np.argsort(row, kind="stable")
-    row, rotation = row[order], np.concatenate([first, second[extra]])[order]
-    return row, rotate_poses(xy[row], sized[row], design[row], rotation, ncc[row], whole)
+    row, rotation = row[order], np.concatenate([first, second[is_other]])[order]
+    sized = size[row, rotation][:, None, None] * A[row]
+    return row, rotate_poses(xy[row], sized, whole.rotated_design[rotation], rotation, ncc[row], whole)
 
 
-def _correlate_rotations(levels: Sequence[Float32], xy: Float, A: Float, design: Int, whole: Templates) -> Float32:
-    """Return the correlations (N, R) of N ellipses with all R rotations; -inf for rotations of other designs."""
+def _correlate_rotations(levels: Sequence[Float32], xy: Float, A: Float, whole: Templates) -> Float32:
+    """Return the correlations (N, R) of N ellipses with all R rotations of all designs."""
     values = sample_pyramid(levels, choose_level(short_semi_axis(A), WHOLE_RADIUS_PX, levels), xy, A, whole.points)
     ncc = normalise_rows(values) @ whole.rotated.T
     cut, outside = find_samples_outside(levels[0], xy, A, whole.points)
     ncc[cut] = _correlate_inside(values[cut], ~outside, whole.rotated)
-    ncc[whole.rotated_design != design[:, None]] = -np.inf
-    return ncc
+    return np.asarray(ncc, np.float32)
 
 
 def rotate_poses(xy: Float, A: Float, design: Int, rotation: Int, ncc: Float32, templates: Templates) -> Poses:

@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from kpbench.types import Float, Float32, Int, UInt8
 
-MOST_LEVELS, LEAST_SIDE_PX = 7, 16
+MOST_LEVELS, LEAST_SIDE_PX = 12, 16
 """A level is halved again if its shorter side is at least ``LEAST_SIDE_PX``, until there are ``MOST_LEVELS`` levels."""
 REMAP_ROWS = 2**14
 """Largest number of poses that are sampled in one call of OpenCV's remap, which takes fewer than 2**15 rows."""
 LEAST_DEVIATION = 1.0
 """Grey levels that are added in quadrature to standard deviations, so that an even surface has correlations near 0."""
+SURROUNDINGS_PX, SURROUNDINGS_STEP_PX = 192, 6
+"""Noise and grey range are measured in a square of this side around a place, from every sixth pixel, px of a level."""
 
 
 def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
@@ -49,26 +51,58 @@ def build_pyramid(image: UInt8, smooth_px: float = 0.7) -> list[Float32]:
 
 
 class Pyramids:
-    """The two pyramids of a grey image, and two measures of the image.
+    """The two pyramids of a grey image, and measures of the surroundings of places.
 
     Attributes
     ----------
     raw, smooth : list of ndarray, float32
         :func:`build_pyramid` of the image, without and with smoothing of level 0.
-    noise : float
-        Standard deviation of the image's noise, grey levels. The estimate is based on the median of second differences,
-        which edges hardly change.
-    grey_range : float
-        Difference between the bright and the dark parts of the image (98th and 2nd percentile), grey levels.
     """
 
     def __init__(self, grey: UInt8) -> None:
         self.raw, self.smooth = build_pyramid(grey, 0), build_pyramid(grey)
-        kernel = np.outer([1, -2, 1], [1, -2, 1]).astype(np.float32)
-        differences = cv2.filter2D(grey, cv2.CV_16S, kernel)[::2, ::2]  # integers, because their median takes less time
-        self.noise = 1.4826 / 6 * float(np.median(np.abs(differences)))
-        dark, bright = np.percentile(grey[::4, ::4], (2, 98))
-        self.grey_range = float(bright - dark)
+        self._differences: dict[int, Float32] = {}
+
+    def _second_differences(self, level: int) -> Float32:
+        if level not in self._differences:
+            second = np.array([1, -2, 1], np.float32)
+            self._differences[level] = np.asarray(cv2.sepFilter2D(self.raw[level], cv2.CV_32F, second, second))
+        return self._differences[level]
+
+    def measure_surroundings(self, xy: Float, level: Int) -> tuple[Float, Float]:
+        """Measure noise and grey range in a square of ``SURROUNDINGS_PX`` px of a level around each of N places.
+
+        Parameters
+        ----------
+        xy : ndarray of shape (N, 2)
+            Places, px of the image. A square that would cross the border of the image is moved into the image.
+        level : ndarray of shape (N,), int64
+            Level of each place, at most the number of levels.
+
+        Returns
+        -------
+        noise : ndarray of shape (N,)
+            Standard deviation of the noise, grey levels, from the median of second differences, which edges hardly
+            change.
+        grey_range : ndarray of shape (N,)
+            Difference between the bright and the dark parts (98th and 2nd percentile), grey levels.
+        """
+        noise, grey_range = np.empty(len(xy)), np.empty(len(xy))
+        for n in np.unique(level).tolist():
+            rows, image, differences = np.flatnonzero(level == n), self.raw[n], self._second_differences(n)
+            x, y = (_window(xy[rows, axis] * 0.5**n, side) for axis, side in enumerate(image.shape[::-1]))
+            at = y[:, :, None], x[:, None]
+            noise[rows] = 1.4826 / 6 * np.median(np.abs(differences[at]).reshape(len(rows), -1), axis=1)
+            dark, bright = np.percentile(image[at].reshape(len(rows), -1), (2, 98), axis=1)
+            grey_range[rows] = bright - dark
+        return noise, grey_range
+
+
+def _window(centre: Float, side: int) -> Int:
+    """Return the positions (N, M) along one axis of samples around centres (N,) px, all in [0, side)."""
+    offsets = np.arange(-SURROUNDINGS_PX // 2, SURROUNDINGS_PX // 2 + 1, SURROUNDINGS_STEP_PX)
+    middle = np.clip(np.rint(centre).astype(np.int64), offsets[-1], max(side - 1 - offsets[-1], offsets[-1]))
+    return np.asarray(np.clip(middle[:, None] + offsets, 0, side - 1))
 
 
 def sample_pyramid(levels: Sequence[Float32], level: Int, xy: Float, A: Float, points: Float) -> Float32:

@@ -77,7 +77,9 @@ def blur_views(views: Float32, A: Float, blur_px: Float) -> Float32:
     return np.fft.irfft2(spectrum * passed, s=(side, side)).reshape(views.shape).astype(np.float32)
 
 
-def sample_surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = None) -> Float32:
+def sample_surroundings(
+    levels: Sequence[Float32], xy: Float, A: Float | None = None, octave: Int | None = None
+) -> Float32:
     """Return the grey values around N places in several octaves of the image.
 
     Parameters
@@ -87,7 +89,9 @@ def sample_surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = 
     xy : ndarray of shape (N, 2)
         Places, px.
     A : ndarray of shape (N, 2, 2), optional
-        Map from px of the result's finest octave to px of the image. None: the identity.
+        Map from px of the result's finest octave to px of level ``octave``. None: the identity.
+    octave : ndarray of shape (N,), int64, optional
+        Level of the result's finest octave. None: the image itself, level 0.
 
     Returns
     -------
@@ -96,8 +100,9 @@ def sample_surroundings(levels: Sequence[Float32], xy: Float, A: Float | None = 
     ticks = np.arange(VIEW_PX) - (VIEW_PX - 1) / 2
     points = np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
     A = np.tile(np.eye(2), (len(xy), 1, 1)) if A is None else A
+    finest = np.zeros(len(xy), np.int64) if octave is None else octave
     grey = np.empty((len(xy), OCTAVES, len(points)), np.float32)
-    for octave in range(OCTAVES):
-        level = np.full(len(xy), min(octave, len(levels) - 1))
-        grey[:, octave] = sample_pyramid(levels, level, xy, A * 2.0**octave, points)
+    for k in range(OCTAVES):
+        level = np.minimum(finest + k, len(levels) - 1)
+        grey[:, k] = sample_pyramid(levels, level, xy, A * 2.0 ** (finest + k)[:, None, None], points)
     return grey.reshape(-1, OCTAVES, VIEW_PX, VIEW_PX)

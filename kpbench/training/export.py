@@ -17,8 +17,9 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from kpbench.detectors.heads import CELL_PX
 from kpbench.detectors.inference import open_session
-from kpbench.detectors.superpoint import CELL_PX, SCHEMA
+from kpbench.detectors.superpoint import SCHEMA
 from kpbench.errors import DataError
 from kpbench.training.checkpoint import load_mean_network, read_checkpoint
 from kpbench.training.network import SuperPoint

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from kpbench.detectors.superpoint import CELL_PX
+from kpbench.detectors.heads import CELL_PX
 from kpbench.training.recipe import LossConfig
 
 

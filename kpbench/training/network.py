@@ -21,7 +21,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from kpbench.detectors.superpoint import CELL_PX
+from kpbench.detectors.heads import CELL_PX
 from kpbench.training.recipe import NetworkConfig
 
 HALVINGS = 3

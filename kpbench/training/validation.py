@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from kpbench.detectors.superpoint import decode
+from kpbench.detectors.heads import decode
 from kpbench.patches.design import Patch
 from kpbench.training.batches import Batch, make_batch
 from kpbench.training.network import SuperPoint

@@ -8,10 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
 
+from kpbench.detectors.heads import Decoding, decode
 from kpbench.detectors.hypotheses import VerifiedCandidates
 from kpbench.detectors.inference import open_session
 from kpbench.detectors.interface import load_detector
-from kpbench.detectors.superpoint import Decoding, SmallSuperPointDetector, SuperPointDetector, decode, pad_to_cells
+from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector, pad_to_cells
 from kpbench.errors import DataError
 from kpbench.patches.design import parse_patch, shipped_patches
 
@@ -238,6 +239,24 @@ def test_a_batch_gives_what_single_images_give(detector):
     assert detector.batch([]) == []
     with pytest.raises(DataError, match="images of one size"):
         detector.batch([images[0], images[0, :40]])
+
+
+def test_strips_of_a_large_picture_give_what_the_whole_gives(monkeypatch):
+    detector = SmallSuperPointDetector(threads=1)
+    image = np.random.default_rng(0).integers(0, 255, (400, 203), np.uint8)
+    whole = detector.heads([image])
+    monkeypatch.setattr("kpbench.detectors.superpoint.STRIP_PIXELS", 208 * 137)
+    for one, other in zip(whole, detector.heads([image]), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "smallest"), [(480, 640, 60.0), (3000, 4000, 93.75), (99, 400, 49.5), (20, 20, 10.0)]
+)
+def test_octaves_go_on_to_a_short_side_of_fifty_pixels(height, width, smallest):
+    scales = SmallSuperPointDetector().view_scales(height, width)
+    assert scales[:2] == (1.2, 0.5)
+    assert min(height, width) * scales[-1] == pytest.approx(smallest)
 
 
 def test_weights_are_a_detector_by_the_name_of_their_file(tmp_path):

@@ -162,3 +162,10 @@ def test_a_design_whose_centre_looks_the_same_after_half_a_turn_is_found_in_ever
         background = procedural_background(np.random.default_rng(1), 120, 120)
         found = find(render_scene(background, [Placement(patch, H, 40.0, 215.0)]).image)
         assert np.hypot(*(found.xy - (60.2, 58.7)).T).min(initial=9) < 0.05, angle
+
+
+def test_a_design_that_it_does_not_see_is_refused():
+    turns = (0.0, 36.0, 72.0, 108.0, 144.0)
+    five = Patch("five", 5, "white", tuple(SemiCircle(1.0, turn, "invert") for turn in turns))
+    with pytest.raises(DataError, match=r"design 'five': template does not find it in its own drawing"):
+        TemplateDetector((five,))

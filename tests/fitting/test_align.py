@@ -5,7 +5,7 @@ from helpers import rotation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from kpbench.fitting.align import AMBIGUOUS_NCC, align_poses, rotate_within_ellipse, short_semi_axis
+from kpbench.fitting.align import align_poses, rotate_within_ellipse, short_semi_axis
 from kpbench.fitting.pyramid import build_pyramid
 from kpbench.fitting.sector_search import CORE_RADIUS_PX, estimate_size, search_sectors
 from kpbench.fitting.templates import VIEW_PX, VIEW_REACH, build_templates
@@ -86,10 +86,8 @@ def ellipse(A):
 def test_a_design_is_turned_within_its_ellipse(number, first, second):
     xy, A = np.array([60.3, 59.6]), rotation(first) @ np.diag([24.0, 17.0]) @ rotation(second)
     levels = build_pyramid(render_design(number, A, xy))
-    design = np.arange(len(PATCHES))
-    rows, poses = rotate_within_ellipse(levels, np.tile(xy, (4, 1)), np.tile(ellipse(A), (4, 1, 1)), design, TEMPLATES)
-    assert set(rows) == set(design)
-    assert (poses.design == design[rows]).all()
+    rows, poses = rotate_within_ellipse(levels, xy[None], ellipse(A)[None], TEMPLATES)
+    assert rows.tolist() == [0, 0]
     best = poses.ncc.argmax()
     assert poses.design[best] == number
     assert poses.ncc[best] > 0.9
@@ -102,12 +100,13 @@ def test_a_design_is_turned_within_its_ellipse(number, first, second):
 @pytest.mark.parametrize("number", range(len(PATCHES)))
 def test_an_ellipse_that_is_a_fifth_too_large_still_gives_the_design(number):
     xy, A = np.array([[60.0, 60.0]]), np.diag([24.0, 17.0])
-    levels, design = build_pyramid(render_design(number, A, xy[0])), np.array([number])
+    levels = build_pyramid(render_design(number, A, xy[0]))
     for size in (1.0, 1.2):
-        _, poses = rotate_within_ellipse(levels, xy, size * A[None], design, TEMPLATES)
-        assert poses.ncc[0] > 0.85
-    _, poses = rotate_within_ellipse(levels, xy, 1.2 * A[None], design, TEMPLATES, np.array([False]))
-    assert poses.A[0] @ poses.A[0].T == pytest.approx((1.2 * A) @ (1.2 * A).T)
+        rows, poses = rotate_within_ellipse(levels, xy, size * A[None], TEMPLATES)
+        best = poses.ncc.argmax()
+        assert rows.tolist() == [0, 0]
+        assert poses.design[best] == number
+        assert poses.ncc[best] > 0.85
 
 
 def test_where_nothing_tells_two_rotations_apart_both_are_given():
@@ -118,14 +117,11 @@ def test_where_nothing_tells_two_rotations_apart_both_are_given():
         render_design(number, 18.0 * rotation(np.degrees(whole.rotated_angle[n])), where).astype(float)
         for n in (own[0], least)
     )
-    xy, A, design = where[None], np.diag([18.0, 18.0])[None], np.array([number])
-    rows, poses = rotate_within_ellipse(
-        build_pyramid((0.5 * one + 0.5 * other).astype(np.uint8)), xy, A, design, TEMPLATES
-    )
+    xy, A = where[None], np.diag([18.0, 18.0])[None]
+    rows, poses = rotate_within_ellipse(build_pyramid((0.6 * one + 0.4 * other).astype(np.uint8)), xy, A, TEMPLATES)
     assert rows.tolist() == [0, 0]
-    assert poses.ncc[0] - AMBIGUOUS_NCC < poses.ncc[1] <= poses.ncc[0]
-    rows, _ = rotate_within_ellipse(build_pyramid(one.astype(np.uint8)), xy, A, design, TEMPLATES)
-    assert rows.tolist() == [0]
+    assert poses.ncc[1] <= poses.ncc[0]
+    assert np.any(poses.design[1] != poses.design[0]) or np.linalg.norm(poses.A[1] - poses.A[0]) > 5
 
 
 def test_a_view_knows_what_lies_outside_and_takes_its_inks_from_what_does_not():

@@ -29,8 +29,8 @@ from kpbench.synth.synthetic import SynthConfig
 
 HERE = Path(__file__).parent
 SIZE, TAGS_SIZE = (320, 240), (640, 480)
-SCORE_BAND = {"template": (0.295, 0.305), "superpoint": (0.27, 0.33), "superpoint-small": (0.27, 0.33)}
-"""Range of scores around the threshold of a detector, 0.3, in which no detection may lie."""
+SCORE_BAND = {"template": (0.295, 0.305), "superpoint": (0.47, 0.53), "superpoint-small": (0.47, 0.53)}
+"""Range of scores around the threshold of a detector in which no detection may lie."""
 PROCESSORS = (
     {},
     {"OPENCV_CPU_DISABLE": "AVX2"},

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.detectors.heads import Decoding
 from kpbench.detectors.hypotheses import Hypotheses, select_likeliest
-from kpbench.detectors.superpoint import DISC_SHARE, Decoding
+from kpbench.detectors.superpoint import DISC_SHARE
 from kpbench.detectors.suppression import suppress
 from kpbench.fitting.align import short_semi_axis
 from kpbench.patches.design import Patch

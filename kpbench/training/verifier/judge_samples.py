@@ -110,11 +110,11 @@ def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> I
     """
     detector = load_places_detector(detector_path)
     grey, keypoints = read_image(image, train)
-    xy, score, log_id = detector.candidates([grey])[0]
+    xy, score, log_id, octave = detector.candidates([grey])[0]
     patch_ids = np.array([patch.patch_id for patch in detector.patches])[log_id[:, :-1].argmax(axis=1)]
     right = mark_correct(xy, patch_ids, keypoints, FIT_TOLERANCE)
     pyramids = Pyramids(grey)
-    first_look = propose_poses(pyramids, xy, score, log_id, detector.patches)
+    first_look = propose_poses(pyramids, xy, score, log_id, detector.patches, octave=octave)
     log_odds, corrected = judge(FIRST_JUDGE, first_look, detector.patches)
     again = corrected[log_odds >= SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN]
     second_look = look_again(pyramids, again, detector.patches)
