@@ -189,7 +189,7 @@ def shipped_cameras() -> dict[str, Path]:
     --------
     >>> from kpbench.camera import shipped_cameras
     >>> list(shipped_cameras())
-    ['action-cam', 'industrial', 'phone', 'webcam']
+    ['action-cam', 'everyday', 'industrial', 'phone', 'webcam']
     """
     return shipped_files("cameras")
 

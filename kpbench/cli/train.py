@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -97,8 +98,9 @@ def train(
     """Train the detector's network by a recipe, or the networks that verify its candidates.
 
     The detector is trained on samples that are made on the fly. An interrupted run can be resumed. On a CPU, a resumed
-    run gives the same bits as an uninterrupted run. The verifier is trained on synthetic DATASETs. Its training writes
-    ellipse.onnx, or first-judge.onnx and second-judge.onnx.
+    run gives the same bits as an uninterrupted run. If the recipe has a table "verifier", the networks that verify
+    candidates are then trained too, and all weights lie in the run's folder "weights". With --verifier, these networks
+    are trained alone, on synthetic DATASETs.
 
     \b
     Examples:
@@ -151,18 +153,25 @@ def _train_detector(
     with _needs_torch("train"):
         from kpbench.training.loop import TrainOptions
         from kpbench.training.loop import train as train_network
+        from kpbench.training.pipeline import make_weights
     folder = out or Path("runs") / recipe.name
+    designs = load_patches(patches) if patches else shipped_patches()
+    processes, began = 1 if workers is None else workers, time.monotonic()
     finished = train_network(
         recipe,
         folder,
         backgrounds,
-        patches=load_patches(patches) if patches else shipped_patches(),
-        options=TrainOptions(
-            init, resume, minutes, 1 if workers is None else workers, threads, tensorboard=tensorboard
-        ),
+        patches=designs,
+        options=TrainOptions(init, resume, minutes, processes, threads, tensorboard=tensorboard),
         say=lambda line: echo(line, err=True),
     )
     echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
+    if finished and recipe.verifier is not None:
+        left = None if minutes is None else minutes - (time.monotonic() - began) / 60
+        finished = make_weights(
+            recipe, folder, backgrounds, patches=designs, minutes=left, workers=processes, threads=threads, say=echo
+        )
+        echo(f"{folder / 'weights'}: {'finished' if finished else 'go on with --resume'}")
 
 
 def _train_verifier(

@@ -80,10 +80,10 @@ def _limit_allocator() -> None:
     onnxruntime.create_and_register_allocator(place, onnxruntime.OrtArenaCfg(TRIAL_BYTES, -1, -1, -1))
 
 
-def try_network(model: bytes, name: str) -> None:
-    """Run a network of unknown origin once on a small image, within limits. A small file may declare any work.
+def try_network(model: bytes, name: str, given: dict[str, Float32] | None = None) -> None:
+    """Run a network of unknown origin once on small inputs, within limits. A small file may declare any work.
 
-    ``name`` : name of the file, for the message.
+    ``name`` : name of the file, for the message. ``given`` : the inputs. None: one small image.
 
     Raises
     ------
@@ -102,7 +102,7 @@ def try_network(model: bytes, name: str) -> None:
     def try_once() -> None:
         try:
             loaded.append(onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"]))
-            loaded[0].run(None, {"image": np.zeros((1, 1, TRIAL_PX, TRIAL_PX), np.float32)}, run)
+            loaded[0].run(None, given or {"image": np.zeros((1, 1, TRIAL_PX, TRIAL_PX), np.float32)}, run)
         except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
             problem.append(error)
 

@@ -16,12 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.detectors.heads import CELL_PX, Decoding, identify, locate
-from kpbench.detectors.hypotheses import clipped_semi_axis
+from kpbench.detectors.hypotheses import UNUSED_COLUMNS, Evidence, clipped_semi_axis
 from kpbench.detectors.inference import open_session, runs_on_gpu, try_network
 from kpbench.detectors.suppression import suppress
-from kpbench.detectors.verification import WEIGHTS, verifier_version, verify_candidates
+from kpbench.detectors.verification import (
+    ELLIPSE,
+    FIRST_JUDGE,
+    SECOND_JUDGE,
+    VERIFIER_NETWORKS,
+    WEIGHTS,
+    verifier_version,
+    verify_candidates,
+)
 from kpbench.errors import DataError, system_reason
 from kpbench.files import load_json, read_bytes
+from kpbench.fitting.templates import VIEW_PX
+from kpbench.fitting.views import OCTAVES
 from kpbench.images import resize, to_grey
 from kpbench.memory import require_memory
 from kpbench.patches.design import parse_patch
@@ -75,7 +85,8 @@ class SuperPointDetector:
     ----------
     path : Path, optional
         ONNX file written by ``kpbench export-model``. None: the weights that ship with kpbench, as 8-bit integers on a
-        CPU and as float32 on a GPU.
+        CPU and as float32 on a GPU. If ``ellipse.onnx``, ``first-judge.onnx`` and ``second-judge.onnx`` lie beside the
+        file, they verify its candidates in place of the shipped ones.
     threshold : float, optional
         Least score of a detection, in [0, 1]. None: 0.5.
     verified : bool
@@ -122,6 +133,8 @@ class SuperPointDetector:
             model = read_bytes(self.path)
             if self.path != ours:
                 try_network(model, str(self.path))
+            if self._weights != WEIGHTS:
+                _try_verifier(self._weights)
             self._session, text = open_session(model, self.threads)
             content = load_json(text or "{}")
         except DataError:
@@ -145,8 +158,16 @@ class SuperPointDetector:
         self.patches = tuple(parse_patch(table, str(self.path)) for table in content["patches"])
         self.verified = self.verified and all(len(set(patch.cells[2][0])) > 1 for patch in self.patches)
         if self.verified:
-            self.version += f"-{verifier_version(CANDIDATE_SCORE, self.scales or (*SCALES, LEAST_SHORT_SIDE_PX))}"
+            self.version += (
+                f"-{verifier_version(self._weights, CANDIDATE_SCORE, self.scales or (*SCALES, LEAST_SHORT_SIDE_PX))}"
+            )
         self._patch_ids = np.array([patch.patch_id for patch in self.patches], np.int64)
+
+    @property
+    def _weights(self) -> Path:
+        """Folder of the networks that verify: beside ``path`` if all of them lie there, else the shipped ones."""
+        folder = Path(self.path or WEIGHTS).parent
+        return folder if all((folder / f"{name}.onnx").is_file() for name in VERIFIER_NETWORKS) else WEIGHTS
 
     @property
     def _bytes_per_pixel(self) -> float:
@@ -251,7 +272,7 @@ class SuperPointDetector:
         """Return the detections among the candidates of one image."""
         if not self.verified:
             return Detections(xy, score, self._patch_ids[np.argmax(log_id[:, :-1], axis=1)])
-        found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads, octave)
+        found = verify_candidates(grey, xy, score, log_id, self.patches, self.threads, octave, self._weights)
         likely = np.flatnonzero((found.score >= self._threshold) & _inside(found.xy, grey))
         xy, score, reach = found.xy[likely], found.score[likely], DISC_SHARE * clipped_semi_axis(found.A[likely])
         kept = suppress(xy, score, np.maximum(Decoding.separation_px, reach))
@@ -272,6 +293,29 @@ class SmallSuperPointDetector(SuperPointDetector):
     """
 
     shipped: ClassVar[str] = "superpoint-small"
+
+
+def _try_verifier(weights: Path) -> None:
+    """Run the three networks of a folder once on zeros, within limits.
+
+    Raises
+    ------
+    DataError
+        If a file cannot be read or is no such network.
+    """
+    view = np.zeros((1, 2, VIEW_PX, VIEW_PX), np.float32)
+    for name, inputs in (
+        (ELLIPSE, {"surroundings": np.zeros((1, OCTAVES, VIEW_PX, VIEW_PX), np.float32)}),
+        (FIRST_JUDGE, {"view": view, "evidence": np.zeros((1, Evidence.RADIUS + 1), np.float32)}),
+        (SECOND_JUDGE, {"view": view, "evidence": np.zeros((1, len(Evidence) + UNUSED_COLUMNS), np.float32)}),
+    ):
+        file = weights / f"{name}.onnx"
+        try:
+            try_network(read_bytes(file), str(file), inputs)
+        except DataError:
+            raise
+        except Exception as error:  # ONNX Runtime raises classes of its own, which are not public
+            raise DataError(f"{file}: cannot be read as an ONNX model ({_first_line(error)})") from None
 
 
 def _first_line(error: Exception) -> str:

@@ -62,6 +62,7 @@ VERIFIER = "9"
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped networks."""
 ELLIPSE, FIRST_JUDGE, SECOND_JUDGE = "ellipse", "first-judge", "second-judge"
+VERIFIER_NETWORKS = (ELLIPSE, FIRST_JUDGE, SECOND_JUDGE)
 """Names of the networks, without ``.onnx``."""
 
 # The limits were chosen on synthetic images over training photographs: notebook/training-log.md, "Specks, sizes, and
@@ -98,6 +99,7 @@ def verify_candidates(
     patches: Sequence[Patch],
     threads: int = 0,
     octave: Int | None = None,
+    weights: Path = WEIGHTS,
 ) -> VerifiedCandidates:
     """Compare candidates with the likely designs, and fit the candidates that look like a patch.
 
@@ -117,6 +119,8 @@ def verify_candidates(
     octave : ndarray of shape (n,), int64, optional
         Pyramid level of the picture in which each candidate was found: 1 if the picture had half the size of the image.
         The networks see the candidate in this picture. None: all were found in the image itself.
+    weights : Path
+        Folder of the three networks.
 
     Returns
     -------
@@ -138,13 +142,13 @@ def verify_candidates(
     """
     pyramids = Pyramids(grey)
     with one_blas_thread():
-        proposed = propose_poses(pyramids, xy, network_score, log_id, patches, threads, octave)
-        log_odds, corrected = judge(FIRST_JUDGE, proposed, patches, threads)
+        proposed = propose_poses(pyramids, xy, network_score, log_id, patches, threads, octave, weights)
+        log_odds, corrected = judge(FIRST_JUDGE, proposed, patches, threads, weights)
         shown_again = look_again(pyramids, corrected[log_odds >= SECOND_LOOK_LOG_ODDS], patches)
-        log_odds, corrected = judge(FIRST_JUDGE, shown_again, patches, threads)
+        log_odds, corrected = judge(FIRST_JUDGE, shown_again, patches, threads, weights)
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
-    log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads)
+    log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads, weights)
     near = _count_near(fitted, xy, np.zeros(len(xy), np.int64) if octave is None else octave)
     log_odds = log_odds - np.log(np.maximum(1.0, near / USUAL_PLACES))  # more candidates do not mean more patches
     best = select_likeliest(fitted.place, log_odds)
@@ -161,7 +165,7 @@ def _count_near(hypotheses: Hypotheses, xy: Float, octave: Int) -> Int:
 
 
 def find_ellipses(
-    pyramids: Pyramids, xy: Float, threads: int = 0, octave: Int | None = None
+    pyramids: Pyramids, xy: Float, threads: int = 0, octave: Int | None = None, weights: Path = WEIGHTS
 ) -> tuple[Float, Float, Float]:
     """Find the ellipse that a patch at each place would fill.
 
@@ -170,7 +174,7 @@ def find_ellipses(
     pyramids : Pyramids
     xy : ndarray of shape (n, 2)
         Places, px. The network was trained on places within about half a short semi-axis of a centre.
-    threads, octave
+    threads, octave, weights
         As for :func:`verify_candidates`.
 
     Returns
@@ -187,7 +191,7 @@ def find_ellipses(
     for first in range(0, len(xy), PLACES_PER_BLOCK):
         block = np.s_[first : first + PLACES_PER_BLOCK]
         given = {"surroundings": sample_surroundings(pyramids.smooth, xy[block], octave=octave[block])}
-        log_odds, shift, log_map = _session(ELLIPSE, threads).run(None, given)
+        log_odds, shift, log_map = _open(weights / f"{ELLIPSE}.onnx", threads).run(None, given)
         of_octave = np.eye(2) * 2.0 ** octave[block, None, None]
         parts.append((*move_poses(xy[block], of_octave, shift, log_map), _clip_log_odds(log_odds)))
     centre, A, every_log_odds = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -227,13 +231,14 @@ def propose_poses(
     patches: Sequence[Patch],
     threads: int = 0,
     octave: Int | None = None,
+    weights: Path = WEIGHTS,
 ) -> Hypotheses:
     """Return hypotheses: the best two poses at every place that may lie on a patch.
 
     The parameters are described at :func:`verify_candidates`.
     """
     octave = np.zeros(len(xy), np.int64) if octave is None else np.minimum(octave, len(pyramids.raw) - 1)
-    centre, A, log_odds = find_ellipses(pyramids, xy, threads, octave)
+    centre, A, log_odds = find_ellipses(pyramids, xy, threads, octave, weights)
     likely = np.flatnonzero(log_odds >= LEAST_ELLIPSE_LOG_ODDS)
     noise, grey_range = pyramids.measure_surroundings(xy[likely], octave[likely])
     templates = build_templates(patches)
@@ -322,7 +327,9 @@ def _fit_level(A: Float, designs: Sequence[Patch], levels: int) -> Int:
     return np.clip(np.ceil(np.log2(np.maximum(size, 1e-6) / FINE_PX)), 0, levels - 1).astype(np.int64)
 
 
-def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0) -> tuple[Float, Hypotheses]:
+def judge(
+    network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0, weights: Path = WEIGHTS
+) -> tuple[Float, Hypotheses]:
     """Run a judge, ``FIRST_JUDGE`` or ``SECOND_JUDGE``, on hypotheses.
 
     Returns
@@ -335,29 +342,31 @@ def judge(network: str, hypotheses: Hypotheses, patches: Sequence[Patch], thread
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     blocks = (hypotheses[n : n + PLACES_PER_BLOCK] for n in range(0, len(hypotheses), PLACES_PER_BLOCK))
-    parts = [_session(network, threads).run(None, judge_inputs(block, patches)) for block in blocks]
+    session = _open(weights / f"{network}.onnx", threads)
+    parts = [session.run(None, judge_inputs(block, patches)) for block in blocks]
     log_odds, shift, log_map = (np.concatenate(column) for column in zip(*parts, strict=True))
     xy, A = move_poses(hypotheses.xy, hypotheses.A, shift, log_map)
     return _clip_log_odds(log_odds), replace(hypotheses, xy=xy, A=A)
 
 
-def verifier_version(*candidate_settings: object) -> str:
+def verifier_version(weights: Path, *candidate_settings: object) -> str:
     """Return the version of the method and a digest of weights and settings, such as "v7-0123abcd".
 
-    The digest is the first 8 hexadecimal digits of a SHA-256 of the three networks and of ``candidate_settings``.
+    The digest is the first 8 hexadecimal digits of a SHA-256 of the three networks in the folder ``weights`` and of
+    ``candidate_settings``.
     """
-    weights = [(WEIGHTS / f"{name}.onnx").read_bytes() for name in (ELLIPSE, FIRST_JUDGE, SECOND_JUDGE)]
-    digest = hashlib.sha256(b"".join([*weights, repr(candidate_settings).encode()])).hexdigest()
+    networks = [(weights / f"{name}.onnx").read_bytes() for name in VERIFIER_NETWORKS]
+    digest = hashlib.sha256(b"".join([*networks, repr(candidate_settings).encode()])).hexdigest()
     return f"v{VERIFIER}-{digest[:8]}"
 
 
-def _session(network: str, threads: int) -> InferenceSession:
-    return _open(network, threads or cv2.getNumThreads())
-
-
 @cache
-def _open(network: str, threads: int) -> InferenceSession:
-    return open_session((WEIGHTS / f"{network}.onnx").read_bytes(), threads)[0]
+def _open_session(network: Path, threads: int) -> InferenceSession:
+    return open_session(network.read_bytes(), threads)[0]
+
+
+def _open(network: Path, threads: int) -> InferenceSession:
+    return _open_session(network, threads or cv2.getNumThreads())
 
 
 def _contrast_evidence(contrast: Float, hypotheses: Hypotheses) -> list[Float]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,7 @@ def save_checkpoint(state: TrainingState, path: Path, patches: Sequence[Patch]) 
             tensors[f"optimizer.{key}.{name}"] = value
     content = {
         "schema": SCHEMA,
-        "recipe": asdict(state.recipe),
+        "recipe": {key: value for key, value in asdict(state.recipe).items() if key != "verifier"},
         "step": state.step,
         "seconds": round(state.seconds, 1),
         "patches": [p.to_dict() for p in patches],
@@ -180,7 +180,8 @@ def restore_state(state: TrainingState, path: Path, patches: Sequence[Patch]) ->
     """
     content, tensors = read_checkpoint(path, is_noted=False)
     theirs = parse_recipe(content["recipe"], str(path))
-    changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(state.recipe, f.name)]
+    ours = replace(state.recipe, verifier=None)  # how the verification is trained does not matter to this network
+    changed = [f.name for f in fields(Recipe) if getattr(theirs, f.name) != getattr(ours, f.name)]
     if changed:
         raise DataError(f"{path}: was trained with another {' and '.join(changed)}; use another folder as `out`")
     if content["designs"] != digest_designs(patches):

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from pathlib import Path
+from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
@@ -138,6 +139,80 @@ class Phase:
 
 
 @dataclass(frozen=True)
+class VerifierSet:
+    """A synthetic dataset that trains the networks of the verification.
+
+    Attributes
+    ----------
+    images : int
+    seed : int
+        Seed of the dataset, see :class:`kpbench.SynthConfig`.
+    deteriorate : str
+        "none", "paper" or "ladder".
+    camera : str
+        Name or file of a camera, see :func:`kpbench.camera.load_camera_preset`; "none" for a linear world.
+    radius_px : tuple of 2 float, or ()
+        Smallest and largest radius of the patches, px. (): the default radii.
+    distractors : int
+        Largest number of look-alikes per image.
+    size : tuple of 2 int
+        Width and height, px.
+
+    Examples
+    --------
+    >>> from kpbench.training import VerifierSet
+    >>> VerifierSet(images=1000, camera="phone").deteriorate
+    'paper'
+    """
+
+    images: int
+    seed: int = 0
+    deteriorate: str = "paper"
+    camera: str = "none"
+    radius_px: tuple[float, ...] = ()
+    distractors: int = 0
+    size: tuple[int, int] = (640, 480)
+
+
+@dataclass(frozen=True)
+class VerifierConfig:
+    """How the networks of the verification are trained after the detector's network.
+
+    Attributes
+    ----------
+    sets : tuple of VerifierSet
+        Images to train on.
+    test : VerifierSet
+        Images on which log odds are calibrated and the reports are measured.
+    ellipse_epochs, judge_epochs : int
+        Passes over the places, and over the hypotheses.
+    first_sets : int
+        Number of ``sets``, from the first one on, that train judges which only serve to correct poses for the judges
+        that are kept.
+
+    Examples
+    --------
+    >>> from kpbench.training import load_recipe
+    >>> load_recipe("paper").verifier is None
+    True
+    """
+
+    sets: tuple[VerifierSet, ...]
+    test: VerifierSet
+    ellipse_epochs: int = 6
+    judge_epochs: int = 10
+    first_sets: int = 1
+
+    def __post_init__(self) -> None:
+        if not self.sets or min(s.images for s in (*self.sets, self.test)) < 1:
+            raise DataError("verifier: expected at least one set, and at least one image in each set")
+        if not 1 <= self.first_sets <= len(self.sets):
+            raise DataError(f"verifier.first_sets is {self.first_sets}, expected a number from 1 to {len(self.sets)}")
+        if any(len(s.radius_px) not in (0, 2) for s in (*self.sets, self.test)):
+            raise DataError("verifier: radius_px needs two numbers, the smallest and the largest radius")
+
+
+@dataclass(frozen=True)
 class Recipe:
     """A training recipe. Recipe, photographs, designs and initial weights together determine a training.
 
@@ -171,6 +246,8 @@ class Recipe:
         is far slower on other processors.
     compile : bool
         Whether ``torch.compile`` is used.
+    verifier : VerifierConfig, optional
+        None: only the detector's network is trained.
 
     Raises
     ------
@@ -204,6 +281,7 @@ class Recipe:
     ema: float = 0.999
     precision: str = "fp32"
     compile: bool = False
+    verifier: VerifierConfig | None = None
 
     def __post_init__(self) -> None:
         if not self.phases or min(p.samples for p in self.phases) < 1 or self.batch < 1:
@@ -247,6 +325,7 @@ CHOICES = {  # key → its allowed values
     "schedule": ("step", "cosine"),
     "precision": ("bf16", "fp32"),
     "kind": ("crops", "scenes"),
+    "deteriorate": ("none", "paper", "ladder"),
 }
 
 
@@ -297,6 +376,8 @@ def _has_default(field: Field[Any]) -> bool:
 
 
 def _parse_field(table: TomlTable, key: str, kind: Any) -> Any:
+    if get_origin(kind) is UnionType:
+        kind = get_args(kind)[0]
     if isinstance(kind, type) and is_dataclass(kind):
         return _parse(kind, table.table(key, get_type_hints(kind)))
     if get_origin(kind) is tuple:

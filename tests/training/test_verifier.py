@@ -72,7 +72,7 @@ def test_draws_depend_on_the_images_and_not_on_how_the_folder_is_called(small_da
         kpbench.open_dataset("copy"),
         kpbench.open_dataset(tmp_path / ".." / tmp_path.name / "copy"),
     ]
-    places = [collect_places(image_refs(spelling)[3], True) for spelling in spellings]
+    places = [collect_places(None, image_refs(spelling)[3], True) for spelling in spellings]
     speckled = [read_image(image_refs(spelling)[3], True)[0] for spelling in spellings]
     plain = read_image(image_refs(small_dataset)[3], False)[0]
     for other, image in zip(places, speckled, strict=True):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from kpbench.dataset.folder import Dataset, open_dataset
+from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
 from kpbench.images import to_grey
 from kpbench.types import UInt8
 from kpbench.workers import run_in_order
@@ -97,3 +98,12 @@ def progress_bar(label: str, total: int) -> Iterator[Any]:
     """Show a progress bar on stderr if stderr is a terminal."""
     with tqdm(total=total, desc=label, leave=False, disable=not sys.stderr.isatty()) as bar:
         yield bar
+
+
+@cache
+def load_places_detector(path: Path | None) -> SuperPointDetector:
+    """Return the detector whose candidates are judged; each process loads the detector once.
+
+    ``path`` : file of ``kpbench export-model``. None: ``superpoint-small``.
+    """
+    return SuperPointDetector(path) if path else SmallSuperPointDetector()

@@ -14,7 +14,7 @@ fills. The network does not learn the design of the patch.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import Any, NamedTuple, cast
@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from kpbench.dataset.folder import Dataset
-from kpbench.detectors.superpoint import SmallSuperPointDetector
 from kpbench.detectors.verification import ELLIPSE
 from kpbench.files import make_folder
 from kpbench.fitting.pyramid import Pyramids
 from kpbench.fitting.templates import VIEW_PX
 from kpbench.fitting.views import OCTAVES, sample_surroundings
-from kpbench.training.verifier.dataset_images import ImageRef, map_images
+from kpbench.training.verifier.dataset_images import ImageRef, load_places_detector, map_images
 from kpbench.training.verifier.labels import affine_at_centre, log_ellipse
 from kpbench.training.verifier.small_networks import (
     BATCHNORM_SAMPLES,
@@ -57,6 +56,8 @@ MADE_PLACES, MADE_DEVIATION = 3, 0.22
 keypoint: in x and in y, in short semi-axes."""
 ROTATED_SHARE, OCTAVES_OF_SCALE = 0.7, 0.35
 """Probability that the surroundings of a training place are rotated and scaled; largest change of scale, octaves."""
+OWN_RADIUS_PX = 28.0
+"""A patch of this radius is found in the image itself about as often as in the image of half its size, px."""
 USUAL_LOG_RADIUS = 2.5
 """Natural logarithm of a usual semi-axis in px. An untrained network predicts semi-axes of about this length."""
 RADII_PX = ((0, 5), (5, 8), (8, 12), (12, 20), (20, 1000))
@@ -120,6 +121,7 @@ def train_ellipse(
     test: Dataset,
     out: Path,
     *,
+    detector: Path | None = None,
     epochs: int = 6,
     batch: int = 256,
     from_shipped: bool = False,
@@ -137,6 +139,9 @@ def train_ellipse(
         Synthetic images on which the log odds are calibrated and the report is measured.
     out : Path
         Folder in which the file is written.
+    detector : Path, optional
+        File of ``kpbench export-model`` that holds the detector whose candidates become places. None: the detector
+        ``superpoint-small``.
     epochs, batch : int
         Number of passes over all places, and number of places per step.
     from_shipped : bool
@@ -165,37 +170,36 @@ def train_ellipse(
     if threads:
         torch.set_num_threads(threads)
     parts: list[Places] = []
+    work = partial(collect_places, detector)
     for dataset in datasets:
-        parts += map_images(collect_places, dataset, repeat(True, len(dataset)), workers, str(dataset.path))
+        parts += map_images(work, dataset, repeat(True, len(dataset)), workers, str(dataset.path))
     places = _concatenate(parts)
     say(f"train on {len(places.on_patch)} places, {places.on_patch.float().mean():.0%} on patches")
     network = _train(places, epochs, batch, from_shipped)
-    test_places = _concatenate(map_images(collect_places, test, repeat(False, len(test)), workers, str(test.path)))
+    test_places = _concatenate(map_images(work, test, repeat(False, len(test)), workers, str(test.path)))
     calibrate_log_odds(network, test_places)
     _report(network, test_places, len(test), say)
     seen = [(some.float(),) for some in torch.split(test_places.surroundings[:4096], 64)]
     write_network(network, ["surroundings"], seen, out / f"{ELLIPSE}.onnx", say)
 
 
-@cache
-def _detector() -> SmallSuperPointDetector:
-    """Return the detector whose candidates become places; each process loads the detector once."""
-    return SmallSuperPointDetector()
-
-
-def collect_places(image: ImageRef, train: bool) -> Places:
-    """Return the places of one image.
+def collect_places(detector_path: Path | None, image: ImageRef, train: bool) -> Places:
+    """Return the places of one image, each in the picture of its own scale.
 
     The detector's candidates become places. A candidate that lies neither on a patch (``ON_PATCH``) nor on no patch
     (``OFF_PATCH``) is left out.
 
+    ``detector_path`` : see :func:`load_places_detector`.
     ``train`` : True adds places around the keypoints, keeps at most ``EMPTY_PLACES`` places on no patch, and rotates
     and scales most surroundings. False does none of these three things.
     """
     grey, keypoints = image.read()
     rng = image.rng()
-    known = {patch.patch_id for patch in _detector().patches} >= set(keypoints["patch_id"].tolist())
-    xy = _detector().candidates([grey])[0][0] if known else np.zeros((0, 2))
+    detector = load_places_detector(detector_path)
+    known = {patch.patch_id for patch in detector.patches} >= set(keypoints["patch_id"].tolist())
+    xy, _, _, octave = detector.candidates([grey])[0]
+    if not known:
+        xy, octave = xy[:0], octave[:0]
     own, on, off = _match_places(xy, keypoints)
     centres = np.column_stack([keypoints["x"], keypoints["y"]])
     if train:
@@ -203,16 +207,22 @@ def collect_places(image: ImageRef, train: bool) -> Places:
         repeated = np.tile(np.arange(len(keypoints)), MADE_PLACES)
         offset = rng.normal(0, MADE_DEVIATION, (len(repeated), 2)) * keypoints["radius_minor"][repeated, None]
         xy = np.concatenate([xy[on], xy[off], centres[repeated] + offset])
+        own_octave = np.log2(keypoints["radius_major"] / OWN_RADIUS_PX) + rng.uniform(-0.5, 0.5, len(keypoints))
+        own_octave = np.clip(np.rint(own_octave), 0, None).astype(np.int64)
+        octave = np.concatenate([octave[on], octave[off], own_octave[repeated]])
         own = np.concatenate([own[on], own[off], repeated])
         on = np.repeat([True, False, True], [on.sum(), off.sum(), len(repeated)])
     else:
-        xy, own, on = xy[on | off], own[on | off], on[on | off]
+        xy, octave, own, on = xy[on | off], octave[on | off], own[on | off], on[on | off]
     frame = np.tile(np.eye(2), (len(xy), 1, 1))
     for k in np.flatnonzero(rng.random(len(xy)) < ROTATED_SHARE) if train else ():
         angle = rng.uniform(0, 2 * np.pi)
         c, s = np.array([np.cos(angle), np.sin(angle)]) * 2 ** rng.uniform(-OCTAVES_OF_SCALE, OCTAVES_OF_SCALE)
         frame[k] = [[c, -s], [s, c]]
-    surroundings = sample_surroundings(Pyramids(grey).smooth, xy, frame).astype(np.float16)
+    smooth = Pyramids(grey).smooth
+    octave = np.minimum(octave, len(smooth) - 1)
+    surroundings = sample_surroundings(smooth, xy, frame, octave).astype(np.float16)
+    frame *= 2.0 ** octave[:, None, None]
     shift, log_map = np.zeros((len(xy), 2)), np.zeros((len(xy), 2, 2))
     to_frame = np.linalg.inv(frame[on])
     log_map[on] = log_ellipse(to_frame @ affine_at_centre(keypoints["H_patch2image"][own[on]]))

@@ -1,7 +1,7 @@
 """Collection of the hypotheses on which the judges are trained and tested.
 
 The first judge sees a hypothesis twice. The first look is at the proposed pose. The second look is at the pose that the
-judge corrected at the first look. :func:`collect_looks` collects the hypotheses of both looks, with the shipped first
+judge corrected at the first look. :func:`collect_looks` collects the hypotheses of both looks, with an earlier first
 judge. :func:`collect_fits` collects the fitted hypotheses, with the new first judge.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,7 +19,6 @@ import torch
 from numpy.typing import NDArray
 
 from kpbench.detectors.hypotheses import Hypotheses, select_distinct
-from kpbench.detectors.superpoint import SmallSuperPointDetector, SuperPointDetector
 from kpbench.detectors.verification import (
     FIRST_JUDGE,
     LEAST_FIT_LOG_ODDS,
@@ -30,7 +29,7 @@ from kpbench.detectors.verification import (
     propose_poses,
 )
 from kpbench.fitting.pyramid import Pyramids
-from kpbench.training.verifier.dataset_images import ImageRef
+from kpbench.training.verifier.dataset_images import ImageRef, load_places_detector
 from kpbench.training.verifier.judge_network import Judge, apply_judge
 from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 from kpbench.types import Float, UInt8
@@ -54,9 +53,9 @@ class ImageLooks:
     candidate_right : ndarray of shape (n,), bool
         Whether each candidate, with its likeliest design, is right.
     first_look, second_look : Hypotheses
-        Hypotheses in the proposed poses, and likely hypotheses in the poses that the shipped first judge corrected.
-    shipped_log_odds : ndarray
-        Log odds from the shipped first judge: first for ``first_look``, then for ``second_look``.
+        Hypotheses in the proposed poses, and likely hypotheses in the poses that the earlier first judge corrected.
+    earlier_log_odds : ndarray
+        Log odds from the earlier first judge: first for ``first_look``, then for ``second_look``.
     """
 
     keypoints: NDArray[Any]
@@ -64,7 +63,7 @@ class ImageLooks:
     candidate_right: NDArray[np.bool_]
     first_look: Hypotheses
     second_look: Hypotheses
-    shipped_log_odds: Float
+    earlier_log_odds: Float
 
 
 @dataclass(frozen=True)
@@ -86,26 +85,19 @@ class ImageFits:
     fitted: Hypotheses
 
 
-@cache
-def load_places_detector(path: Path | None) -> SuperPointDetector:
-    """Return the detector whose candidates are judged; each process loads the detector once.
-
-    ``path`` : file of ``kpbench export-model``. None: ``superpoint-small``.
-    """
-    return SuperPointDetector(path) if path else SmallSuperPointDetector()
-
-
 @lru_cache(maxsize=1)
 def _unpack_judge(packed: bytes) -> Judge:
     return cast(Judge, pickle.loads(packed))
 
 
-def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> ImageLooks:
-    """Return the hypotheses of one image at the two looks of the shipped first judge.
+def collect_looks(detector_path: Path | None, weights: Path, image: ImageRef, train: bool) -> ImageLooks:
+    """Return the hypotheses of one image at the two looks of an earlier first judge.
 
     The threshold of the log odds for the second look is ``SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN``.
 
     ``detector_path`` : see :func:`load_places_detector`.
+    ``weights`` : folder of the ellipse network and of the earlier first judge. Without an earlier judge, there is no
+    second look, and all log odds are 0.
     ``train`` : draw specks into every third image.
     """
     detector = load_places_detector(detector_path)
@@ -114,11 +106,15 @@ def collect_looks(detector_path: Path | None, image: ImageRef, train: bool) -> I
     patch_ids = np.array([patch.patch_id for patch in detector.patches])[log_id[:, :-1].argmax(axis=1)]
     right = mark_correct(xy, patch_ids, keypoints, FIT_TOLERANCE)
     pyramids = Pyramids(grey)
-    first_look = propose_poses(pyramids, xy, score, log_id, detector.patches, octave=octave)
-    log_odds, corrected = judge(FIRST_JUDGE, first_look, detector.patches)
-    again = corrected[log_odds >= SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN]
-    second_look = look_again(pyramids, again, detector.patches)
-    log_odds = np.concatenate([log_odds, judge(FIRST_JUDGE, second_look, detector.patches)[0]])
+    first_look = propose_poses(pyramids, xy, score, log_id, detector.patches, octave=octave, weights=weights)
+    if (weights / f"{FIRST_JUDGE}.onnx").exists():
+        log_odds, corrected = judge(FIRST_JUDGE, first_look, detector.patches, weights=weights)
+        again = corrected[log_odds >= SECOND_LOOK_LOG_ODDS - TRAINING_MARGIN]
+        second_look = look_again(pyramids, again, detector.patches)
+        second_log_odds, _ = judge(FIRST_JUDGE, second_look, detector.patches, weights=weights)
+        log_odds = np.concatenate([log_odds, second_log_odds])
+    else:
+        second_look, log_odds = first_look[:0], np.zeros(len(first_look))
     return ImageLooks(keypoints, score, right, _halve_memory(first_look), _halve_memory(second_look), log_odds)
 
 

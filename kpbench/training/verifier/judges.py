@@ -4,10 +4,10 @@ Both judges are small networks with the same layers, but different widths. A jud
 wrong hypotheses, and to correct their poses. :func:`kpbench.training.verifier.labels.label_hypotheses` defines "right".
 
 1. :func:`kpbench.training.verifier.judge_samples.collect_looks` collects the hypotheses that the first judge sees at
-   its first look and at its second look. Before the second look, the shipped first judge corrects the poses, because
-   the new first judge does not exist yet.
+   its first look and at its second look. Before the second look, an earlier first judge corrects the poses, because
+   the new first judge does not exist yet. Without an earlier judge, there is a first look alone.
 2. The new first judge is trained on these hypotheses, before the fit. The centre of a right hypothesis may be 0.2 long
-   semi-axes away from the keypoint. Most hypotheses are easy: the shipped first judge rates them correctly, with high
+   semi-axes away from the keypoint. Most hypotheses are easy: the earlier first judge rates them correctly, with high
    certainty. Easy hypotheses are drawn rarely, and each drawn easy hypothesis gets more weight.
 3. :func:`kpbench.training.verifier.judge_samples.collect_fits` fits the hypotheses that the new first judge finds
    likely.
@@ -32,13 +32,13 @@ from torch import Tensor, nn
 
 from kpbench.dataset.folder import Dataset
 from kpbench.detectors.hypotheses import Hypotheses
-from kpbench.detectors.verification import FIRST_JUDGE, SECOND_JUDGE
+from kpbench.detectors.verification import FIRST_JUDGE, SECOND_JUDGE, WEIGHTS
 from kpbench.files import make_folder
 from kpbench.patches.design import Patch
-from kpbench.training.verifier.dataset_images import map_images
+from kpbench.training.verifier.dataset_images import load_places_detector, map_images
 from kpbench.training.verifier.judge_network import Judge, input_tensors
 from kpbench.training.verifier.judge_report import report_judges
-from kpbench.training.verifier.judge_samples import ImageLooks, collect_fits, collect_looks, load_places_detector
+from kpbench.training.verifier.judge_samples import ImageLooks, collect_fits, collect_looks
 from kpbench.training.verifier.labels import FIT_TOLERANCE, POSE_TOLERANCE, label_hypotheses, pose_errors
 from kpbench.training.verifier.small_networks import (
     BATCHNORM_SAMPLES,
@@ -57,7 +57,7 @@ FIRST_WIDTH, SECOND_WIDTH = 32, 48
 """Number of channels of the first layers: of the first judge, and of the second judge."""
 KNOWN_SHARE = 12.0
 """In an epoch, a hypothesis is drawn with the probability min(KNOWN_SHARE · exp(-z/2), 1). z are the log odds that the
-shipped first judge gives to the true label of the hypothesis."""
+earlier first judge gives to the true label of the hypothesis."""
 
 
 def train_judges(
@@ -66,6 +66,7 @@ def train_judges(
     out: Path,
     *,
     detector: Path | None = None,
+    weights: Path = WEIGHTS,
     epochs: int = 10,
     batch: int = 256,
     from_shipped: bool = False,
@@ -82,6 +83,8 @@ def train_judges(
     detector : Path, optional
         File of ``kpbench export-model`` that holds the detector whose candidates are judged. None: the detector
         ``superpoint-small``.
+    weights : Path
+        Folder of the ellipse network, and of the earlier first judge, if there is one.
 
     Raises
     ------
@@ -102,7 +105,9 @@ def train_judges(
         torch.set_num_threads(threads)
     patches, sets = load_places_detector(detector).patches, [*datasets, test]
     looks = [
-        map_images(partial(collect_looks, detector), part, repeat(part is not test, len(part)), workers, f"look {n}")
+        map_images(
+            partial(collect_looks, detector, weights), part, repeat(part is not test, len(part)), workers, f"look {n}"
+        )
         for n, part in enumerate(sets)
     ]
     settings = _Settings(patches, epochs, batch, from_shipped, say)
@@ -178,10 +183,10 @@ def _label(
 
 
 def _train_first(looks: Sequence[ImageLooks], settings: _Settings) -> Judge:
-    """Train the first judge on the hypotheses of both looks, with the log odds from the shipped first judge."""
+    """Train the first judge on the hypotheses of both looks, with the log odds from the earlier first judge."""
     hypotheses = [look for image in looks for look in (image.first_look, image.second_look)]
     truths = [image.keypoints for image in looks for _ in range(2)]
-    known = np.concatenate([image.shipped_log_odds for image in looks])
+    known = np.concatenate([image.earlier_log_odds for image in looks])
     training = _label(hypotheses, settings.patches, truths, known, POSE_TOLERANCE)
     return _train(training, FIRST_JUDGE, FIRST_WIDTH, settings)
 
