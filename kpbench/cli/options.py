@@ -75,7 +75,8 @@ BACKGROUNDS = click.option(
 CAMERA = click.option(
     "--camera",
     help="Camera that takes the images: industrial, webcam, phone, action-cam, everyday, a .toml file of your own, "
-    "or a calibration of OpenCV, ROS or Kalibr (.yaml, .json). Light is blurred before the tone curve, as in a real camera.",
+    "or a calibration of OpenCV, ROS or Kalibr (.yaml, .json). Light is blurred before the tone curve, as in a real "
+    "camera.",
 )
 ONLY = click.option(
     "--only", type=Names(), default="", help="Only these conditions, such as scale,blur. Default: all conditions."
