@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -119,4 +120,4 @@ def _print_lines(predictions: Predictions) -> None:
     from kpbench.predictions.json_files import encode_lines
 
     for line in encode_lines(predictions, with_header=not len(predictions)):
-        click.echo(line)
+        echo(json.dumps(json.loads(line)))  # in ASCII, so that echo has nothing to escape

@@ -28,7 +28,7 @@ from kpbench.types import KEYPOINT_DTYPE, UInt8
 DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
 """Level of libdeflate, which always gives the same bytes for the same input. ISA-L, zlib-ng and zlib-rs may not."""
-LEAST_SHRINKING = 0.8
+LEAST_SHRINKING = 0.75
 """Images that level 1 shrinks to more than this fraction are stored: shrinking noise takes longer than all else."""
 _INT, _FLOAT = Column(np.dtype("<i8"), ("fletcher32",)), Column(np.dtype("<f8"), ("fletcher32",))
 _TEXT = Column("S", ("gzip", "fletcher32"))

@@ -16,7 +16,7 @@ from kpbench.dataset.folder import Dataset, open_dataset
 from kpbench.dataset.generation import generate
 from kpbench.detectors.verification import ELLIPSE, SECOND_JUDGE
 from kpbench.errors import DataError
-from kpbench.files import make_folder
+from kpbench.files import make_folder, read_bytes
 from kpbench.patches.design import Patch
 from kpbench.render.placement import Limits
 from kpbench.synth.synthetic import SynthConfig
@@ -107,7 +107,7 @@ def make_weights(
     def train_first_judges() -> None:
         sets = [data(s) for s in config.sets[: config.first_sets]]
         judges(sets, data(config.test), make_folder(first), weights=weights, epochs=config.judge_epochs)
-        write_file(first / f"{ELLIPSE}.onnx", (weights / f"{ELLIPSE}.onnx").read_bytes())
+        write_file(first / f"{ELLIPSE}.onnx", read_bytes(weights / f"{ELLIPSE}.onnx"))
 
     def train_kept_judges() -> None:
         judges([data(s) for s in config.sets], data(config.test), weights, weights=first, epochs=config.judge_epochs)

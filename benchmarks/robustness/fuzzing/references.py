@@ -366,6 +366,8 @@ def toml_suite(data: bytes, found: Any) -> str:
             "rungs": got.rungs,
             "pose": dict(got.pose),
             "effects": dict(got.effects),
+            "camera": dict(got.camera),
+            "board": got.board,
         }
         if difference := _first_difference(table, given):
             return difference
