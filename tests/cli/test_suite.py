@@ -23,7 +23,7 @@ def test_a_camera_that_cannot_be_used_is_one_line(tmp_path):
     for name, problem in (
         (
             "no-such",
-            "there is no camera 'no-such', only: action-cam, everyday, industrial, phone, webcam, or a .toml, .yaml or .json",
+            "there is no camera 'no-such', only: action-cam, everyday, industrial, phone, webcam, or a .toml, ",
         ),
         (bad, f"{bad}: camera_matrix is missing, expected the keys of OpenCV, ROS or Kalibr"),
         (tmp_path / "none.yaml", f"{tmp_path / 'none.yaml'}: "),
