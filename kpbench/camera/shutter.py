@@ -25,7 +25,15 @@ from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import Box, bounding_box, rasterise_edges
 from kpbench.geometry.homography import project
-from kpbench.geometry.warp import TOLERANCE_PX, PointMap, bend_homography, join_polygons, linearise, subdivide
+from kpbench.geometry.warp import (
+    TOLERANCE_PX,
+    PointMap,
+    bend_homography,
+    join_polygons,
+    linearise,
+    remember_last,
+    subdivide,
+)
 from kpbench.portable import cos_sin, exp, matmul
 from kpbench.types import Float
 
@@ -162,9 +170,10 @@ class PatchMotion:
             Map from px to px that follows the motion, such as the distortion of the lens.
         """
         centre = H_patch2image[:2, 2] / H_patch2image[2, 2]
+        offsets = remember_last(lambda points: project(H_patch2image, points) - centre)
 
         def move(points: Float, times: Float) -> Float:
-            x, y = (project(H_patch2image, points) - centre).T
+            x, y = offsets(points).T
             if self.turn_deg or self.growth:
                 c, s = cos_sin(np.radians(self.turn_deg) * times)
                 if self.growth:
@@ -223,11 +232,15 @@ class BoardMotion:
         speed = float(np.sqrt((rate * rate).sum()))
         axis = rate / speed if speed else rate
 
-        def move(points: Float, times: Float) -> Float:
+        def turn(points: Float) -> Float:
             if bow is None:
-                turned = matmul(points, R_board2camera[:, :2].T)
-            else:
-                turned = matmul(bow.bend(points), R_board2camera.T)
+                return matmul(points, R_board2camera[:, :2].T)
+            return matmul(bow.bend(points), R_board2camera.T)
+
+        turned_once = remember_last(turn)
+
+        def move(points: Float, times: Float) -> Float:
+            turned = turned_once(points)
             if speed:
                 turned = _turn(turned, axis, speed * times)
             return camera.project(turned + place + times[:, None] * np.array(self.velocity_mm))

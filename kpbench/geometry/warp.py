@@ -174,3 +174,16 @@ def join_polygons(polygons: list[Float]) -> tuple[Float, NDArray[np.int64]]:
     next_vertex = np.arange(1, last[-1] + 2)
     next_vertex[last] = last - sizes + 1
     return np.concatenate(polygons), next_vertex
+
+
+def remember_last(point_map: PointMap) -> PointMap:
+    """Return a map that keeps its last result: a shutter asks for the same array of points at several times."""
+    points, result = np.zeros((0, 2)), np.zeros((0, 2))
+
+    def remember(given: Float) -> Float:
+        nonlocal points, result
+        if given is not points:
+            points, result = given, point_map(given)
+        return result
+
+    return remember
