@@ -79,6 +79,11 @@ class Camera:
         return np.array([[self.focal_px, 0, cx], [0, self.focal_y_px or self.focal_px, cy], [0, 0, 1]])
 
     @cached_property
+    def _middle(self) -> Float:
+        """The principal point, px."""
+        return self.K[:2, 2]
+
+    @cached_property
     def _focal(self) -> Any:
         """The focal length, or the focal lengths along x and y as ndarray of shape (2,)."""
         return self.focal_px if self.focal_y_px is None else np.array([self.focal_px, self.focal_y_px])
@@ -153,7 +158,7 @@ class Camera:
 
     def distort(self, rays: Float) -> Float:
         """Return the image points (N, 2), px, of rays (x, y), shape (N, 2)."""
-        return np.asarray(self._focal * self.lens.distort(rays) + self.K[:2, 2])
+        return np.asarray(self._focal * self.lens.distort(rays) + self._middle)
 
     def undistort(self, points_px: ArrayLike) -> Float:
         """Return the rays (x, y), shape (N, 2), of image points (N, 2), px. The inverse of :meth:`distort`.
