@@ -18,6 +18,7 @@ import kpbench
 import kpbench.predictions
 import kpbench.synth
 import kpbench.training
+from kpbench.camera import load_camera_preset
 
 from . import binary_references, reading, references, seeds
 from .binary import jpeg_segments, mutate_boxes, mutate_jpeg, mutate_png, mutate_riff, mutate_tiff, png_chunks
@@ -143,6 +144,14 @@ ALL_READERS = (
     Reader(
         "recipe", "input.toml", seeds.recipes, of_toml("batch", "phases", "samples", "lr", "widths"),
         kpbench.training.load_recipe, reading.is_toml, references.toml_recipe, toml_of, share=2,
+    ),
+    Reader(
+        "camera", "input.toml", seeds.cameras, of_toml("f_number", "tone", "bayer", "jpeg_quality", "detail"),
+        lambda path: load_camera_preset(str(path)), reading.is_toml, as_seed=toml_of,
+    ),
+    Reader(
+        "calibration", "input.yaml", seeds.calibrations, lambda rng, data: mutate_yaml(rng, json.loads(data)),
+        kpbench.read_camera, reading.is_yaml,
     ),
     Reader(
         "onnx", "input.onnx", seeds.onnx_models, mutate_onnx,

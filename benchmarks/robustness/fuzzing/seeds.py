@@ -205,6 +205,29 @@ def recipes() -> list[bytes]:
     return toml_files("configs/*.toml")
 
 
+def cameras() -> list[bytes]:
+    return toml_files("cameras/*.toml")
+
+
+def calibrations() -> list[bytes]:
+    """Calibration files in the three formats, as trees in JSON."""
+    import yaml
+
+    from kpbench.geometry import Camera, write_camera
+
+    plain = Camera(640, 480, 500.0, (-0.2, 0.05, 0.001, 0.0), focal_y_px=501.0, principal_px=(320.5, 239.0))
+    fisheye = Camera(640, 480, 300.0, (0.1, 0.0, 0.0, 0.0), model="fisheye")
+    trees = []
+    with folder() as where:
+        for camera in (plain, fisheye):
+            write_camera(where / "camera.json", camera)
+            trees.append((where / "camera.json").read_bytes())
+            for form in ("ros", "kalibr"):
+                write_camera(where / f"{form}.yaml", camera, form)  # type: ignore[arg-type]
+                trees.append(as_json(yaml.safe_load((where / f"{form}.yaml").read_text())))
+    return trees
+
+
 # --- Networks ------------------------------------------------------------------------------------------------------
 
 TINY = """
