@@ -2,6 +2,10 @@ from .benchmark import BenchRun as BenchRun
 from .benchmark import SuiteReport as SuiteReport
 from .benchmark import bench as bench
 from .benchmark import write_suite_reports as write_suite_reports
+from .boards.matching import BoardMatch as BoardMatch
+from .boards.matching import find_board as find_board
+from .boards.pose import BoardPose as BoardPose
+from .boards.pose import estimate_pose as estimate_pose
 from .dataset.export import export_dataset as export_dataset
 from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset

@@ -54,6 +54,7 @@ ROOMS = {
     "geometry": [],
     "camera": ["geometry"],
     "patches": ["geometry"],
+    "boards": ["geometry", "patches"],
     "printing": ["geometry", "patches"],
     "render": ["geometry", "patches", "camera"],
     "degrade": ["geometry"],

@@ -9,7 +9,6 @@ from .family import code_of as code_of
 from .family import enumerate_family as enumerate_family
 from .family import inks_of as inks_of
 from .identity import correlation_and_distance as correlation_and_distance
-from .identity import symmetry_order as symmetry_order
 from .localisation import Bound as Bound
 from .localisation import basin as basin
 from .localisation import design_bound as design_bound

@@ -21,7 +21,6 @@ from kpbench.analysis.cell_images import (
     render_cells,
     window_weights,
 )
-from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
 PARTS_OF_IDENTITY = (1.0, 3 / 4)  # fractions of the patch's radius that the window shows
@@ -106,25 +105,3 @@ def _distance_over_turns(grid: PolarGrid, inks: Float32, others: Float32, turns:
         other, other_spread = mean_free_images(weight, views[turn], others)
         best = np.maximum(best, np.einsum("np,np,p->n", first, other, weight) / (spread * other_spread))
     return np.asarray(spread * np.sqrt(np.maximum(1 - best**2, 0)))
-
-
-def symmetry_order(patch: Patch) -> int:
-    """Return the number of rotations within a full turn that leave the print unchanged.
-
-    The rotation by 0 degrees counts, so 1 means that the orientation is unique. 0 means that every rotation leaves the
-    print unchanged.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> from kpbench.analysis import symmetry_order
-    >>> [symmetry_order(patch) for patch in kpbench.shipped_patches()]
-    [2, 1, 1, 1]
-    """
-    _, angles, black = patch.cells
-    if len(angles) == 1:
-        return 0
-    width = np.diff(np.append(angles, angles[0] + 360.0))
-    shifts = range(len(angles))
-    same = (np.allclose(np.roll(width, k), width) and (np.roll(black, k, axis=1) == black).all() for k in shifts)
-    return int(sum(same))

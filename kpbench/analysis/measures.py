@@ -15,12 +15,12 @@ from kpbench.analysis.identity import (
     PARTS_OF_IDENTITY,
     correlation_and_distance,
     mirrored_distance,
-    symmetry_order,
     turned_distance,
 )
 from kpbench.analysis.localisation import CONTRAST, NOISE, PARTS_OF_BASIN, Bound, basin, design_bound, tilt_bias
 from kpbench.analysis.natural_images import LOOKS_ALIKE, natural_response
 from kpbench.patches.design import Patch
+from kpbench.patches.symmetry import symmetry_order
 from kpbench.types import Float, Float32, UInt8
 
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
@@ -40,7 +40,7 @@ class DesignMeasures:
     centre_is_crossing : bool
         See :attr:`kpbench.Patch.centre_is_crossing`.
     symmetry_order : int
-        See :func:`kpbench.analysis.symmetry_order`.
+        See :func:`kpbench.patches.symmetry_order`.
     turned_distance, mirrored_distance : float
         Smallest distances from the design to itself rotated by 45 to 315 degrees, and to its mirror image, in ink
         contrasts.

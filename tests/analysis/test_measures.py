@@ -20,13 +20,14 @@ from kpbench.analysis.cell_images import (
     render_cells,
     render_polygons,
 )
-from kpbench.analysis.identity import correlation_and_distance, mirrored_distance, symmetry_order, turned_distance
+from kpbench.analysis.identity import correlation_and_distance, mirrored_distance, turned_distance
 from kpbench.analysis.localisation import basin, design_bound, tilt_bias
 from kpbench.analysis.measures import pixels_needed
 from kpbench.analysis.natural_images import natural_response, sample_windows
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import rasterise
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
+from kpbench.patches.symmetry import symmetry_order
 
 DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
 ALTERNATIVES = kpbench.load_patches(sorted((DESIGNS / "alternatives").glob("*.toml")))

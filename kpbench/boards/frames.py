@@ -1,0 +1,114 @@
+"""Detections in straight coordinates: without the lens, with the affine frame and the covariance of each point.
+
+A homography H maps the plane of a board to the image, ``H(X) = (a + B X) / w(X)`` with ``w(X) = 1 + cᵀ X``. Its
+derivative at X is ``(B - H(X) cᵀ) / w(X)``. A detection gives H(X) as ``xy``, and the derivative as its frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kpbench.errors import DataError
+from kpbench.geometry.camera import Camera
+from kpbench.types import Detections, Float
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Points and affine frames of n detections in an image without distortion.
+
+    Attributes
+    ----------
+    xy : ndarray of shape (n, 2)
+        Points: rays (x, y) with a camera, px without. nan for a point that the lens cannot show.
+    A : ndarray of shape (n, 2, 2)
+        Affine frame of each patch, from its unit disc.
+    covariance : ndarray of shape (n, 2, 2), or None
+        Covariance of the error of each point.
+    """
+
+    xy: Float
+    A: Float
+    covariance: Float | None
+
+
+def straighten(detections: Detections, camera: Camera | None) -> Frames:
+    """Return the points and frames of detections without the distortion of the lens.
+
+    Raises
+    ------
+    DataError
+        If the detections have no affine frames.
+    """
+    if detections.A_patch2image is None:
+        raise DataError("the detector gives no affine frames (A_patch2image), which a board needs")
+    xy, A, covariance = detections.xy, detections.A_patch2image, detections.covariance
+    if camera is None:
+        return Frames(xy, A, covariance)
+    rays = _undistort(camera, xy)
+    focal = camera.K[[0, 1], [0, 1]]
+    to_ray = np.full((len(rays), 2, 2), np.nan)
+    seen = np.isfinite(rays[:, 0])
+    to_ray[seen] = np.linalg.inv(focal[:, None] * camera.lens.jacobian(rays[seen]))
+    if covariance is not None:
+        covariance = to_ray @ covariance @ to_ray.transpose(0, 2, 1)
+    return Frames(rays, to_ray @ A, covariance)
+
+
+def _undistort(camera: Camera, xy: Float) -> Float:
+    """Return the rays of points, nan for points outside the valid region of the lens."""
+    try:
+        return camera.undistort(xy)
+    except ValueError:
+        if len(xy) == 1:
+            return np.full((1, 2), np.nan)
+        return np.concatenate([_undistort(camera, point[None]) for point in xy])
+
+
+def fit_homography(points: Float, xy: Float, J: Float) -> Float:
+    """Fit a homography to points and to its derivatives at these points, by linear least squares.
+
+    Each point gives the equations ``a + B X - x (1 + cᵀ X) = 0`` and ``B - x cᵀ - J (1 + cᵀ X) = 0``, in which a point
+    and a frame that are wrong by the same part of the disc's radius weigh the same. One point determines an affine map, two points a homography.
+
+    Parameters
+    ----------
+    points : ndarray of shape (n, 2)
+        Points X of the plane, in disc radii.
+    xy : ndarray of shape (n, 2)
+        Their images x.
+    J : ndarray of shape (n, 2, 2)
+        Derivatives of the image by X.
+
+    Returns
+    -------
+    ndarray of shape (3, 3)
+        The homography from the plane to the image.
+    """
+    n, middle, centre = len(points), points.mean(axis=0), xy.mean(axis=0)
+    reach = max(float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())), 1e-9)
+    gauge = np.sqrt(np.abs(np.linalg.det(J)).mean()) * reach  # size of the board in the image
+    X, x, J = (points - middle) / reach, (xy - centre) / gauge, J * (reach / gauge)
+    M, y = np.zeros((n, 6, 8)), np.zeros((n, 6))  # unknown: a (2), B by rows (4), c (2)
+    for k in range(2):
+        M[:, k, k] = 1.0
+        M[:, k, 2 + 2 * k : 4 + 2 * k] = X
+        M[:, k, 6:] = -x[:, k, None] * X
+        y[:, k] = x[:, k]
+        for m in range(2):
+            row = 2 + 2 * k + m
+            M[:, row, 2 + 2 * k + m] = 1.0
+            M[:, row, 6:] = -J[:, k, m, None] * X
+            M[:, row, 6 + m] -= x[:, k]
+            y[:, row] = J[:, k, m]
+    weight = 1.0 / np.sqrt(np.abs(np.linalg.det(J)))  # the size of a patch in the image
+    weights = np.repeat(weight[:, None], 6, axis=1)
+    weights[:, :2] *= reach
+    M, y = weights[:, :, None] * M, weights * y
+    a0, a1, b00, b01, b10, b11, c0, c1 = np.linalg.lstsq(M.reshape(-1, 8), y.ravel(), rcond=None)[0]
+    H = np.array([[b00, b01, a0], [b10, b11, a1], [c0, c1, 1.0]])
+    to_plane = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, reach]])
+    to_image = np.array([[gauge, 0, centre[0]], [0, gauge, centre[1]], [0, 0, 1.0]])
+    return np.asarray(to_image @ H @ to_plane)
