@@ -20,7 +20,6 @@ from kpbench.analysis.identity import (
 from kpbench.analysis.localisation import CONTRAST, NOISE, PARTS_OF_BASIN, Bound, basin, design_bound, tilt_bias
 from kpbench.analysis.natural_images import LOOKS_ALIKE, natural_response
 from kpbench.patches.design import Patch
-from kpbench.patches.symmetry import symmetry_order
 from kpbench.types import Float, Float32, UInt8
 
 SIZES_PX = (5.0, 8.0, 16.0, 45.0)
@@ -40,7 +39,7 @@ class DesignMeasures:
     centre_is_crossing : bool
         See :attr:`kpbench.Patch.centre_is_crossing`.
     symmetry_order : int
-        See :func:`kpbench.patches.symmetry_order`.
+        See :attr:`kpbench.Patch.symmetry_order`.
     turned_distance, mirrored_distance : float
         Smallest distances from the design to itself rotated by 45 to 315 degrees, and to its mirror image, in ink
         contrasts.
@@ -199,7 +198,7 @@ def measure_designs(
             name=patch.name,
             patch_id=patch.patch_id,
             centre_is_crossing=patch.centre_is_crossing,
-            symmetry_order=symmetry_order(patch),
+            symmetry_order=patch.symmetry_order,
             tilt_bias_px=tilt_bias(patch),
             camera_bias_px=camera_bias(patch),
             camera_bias_toned_px=camera_bias(patch, knows_tone=True),

@@ -21,7 +21,6 @@ from kpbench.boards.frames import Frames, fit_homography, straighten
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
-from kpbench.patches.symmetry import symmetry_order
 from kpbench.types import Detections, Float, Int
 
 LEAST_POINTS = 3
@@ -177,45 +176,42 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
 
 def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> Candidates:
     """Return every pair of a detection and a point of its ID, in every rotation that leaves the design unchanged."""
-    unit_mm = float(np.mean([k.diameter_mm / 2 for k in board.keypoints]))
-    turns, to_disc, point = list[Float](), list[Float](), list[int]()
-    for n, k in enumerate(board.keypoints):
-        order = symmetry_order(k.patch)
-        if not order:
+    for k in board.keypoints:
+        if not k.patch.symmetry_order:
             raise DataError(f"board {board.name!r}: {k.patch.name!r} looks the same in every direction")
-        for turn in range(order):
-            c, s = (np.cos(2 * np.pi * turn / order), np.sin(2 * np.pi * turn / order))
-            turns.append(np.array([[c, -s], [s, c]]))
-            to_disc.append(np.linalg.inv(k.H_patch2board[:2, :2] / unit_mm))
-            point.append(n)
-    points, ids = np.array(point), np.array([board.keypoints[n].patch_id for n in point])
-    with np.errstate(invalid="ignore"):
-        usable = np.isfinite(frames.xy).all(axis=1) & (np.linalg.det(frames.A) > 0)
-    detection, row = np.nonzero((patch_id[:, None] == ids) & usable[:, None])
-    turn, X = np.array(turns)[row], board.points_mm[points[row], :2] / unit_mm
-    J = frames.A[detection] @ turn @ np.array(to_disc)[row]
-    return Candidates(detection, points[row], turn, frames.xy[detection], X, J)
+    points, turns, to_patch = board.orientations
+    ids, diameter_mm = np.array([(k.patch_id, k.diameter_mm) for k in board.keypoints]).T
+    unit_mm = float(diameter_mm.mean()) / 2
+    usable = np.isfinite(frames.xy[:, 0]) & (_det(frames.A) > 0)
+    detection, row = np.nonzero((patch_id[:, None] == ids[points]) & usable[:, None])
+    J = unit_mm * frames.A[detection] @ turns[row] @ to_patch[row]
+    X = board.points_mm[points[row], :2] / unit_mm
+    return Candidates(detection, points[row], turns[row], frames.xy[detection], X, J)
+
+
+def _det(matrices: Float) -> Float:
+    """Return the determinants of matrices (n, 2, 2), faster than NumPy."""
+    return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
 def _confirm(seed: Candidates, other: Candidates) -> tuple[NDArray[np.bool_], Float]:
     """Return which candidates confirm each other, (S, T), and the relative errors of their distances, (S, T)."""
-    det_seed, det_other = np.linalg.det(seed.J), np.linalg.det(other.J)
-    ratio = np.cbrt(det_other / det_seed[:, None])
-    dX, dx = other.X - seed.X[:, None], other.xy - seed.xy[:, None]
-    length = np.hypot(dx[..., 0], dx[..., 1])
-    there = ratio[..., None] * np.einsum("sij,stj->sti", seed.J, dX) - dx
-    back = np.einsum("tij,stj->sti", other.J, dX) / ratio[..., None] - dx
-    error = np.hypot(there[..., 0], there[..., 1]) + np.hypot(back[..., 0], back[..., 1])
-    radius = np.sqrt(det_seed)[:, None] + np.sqrt(det_other)
-    difference = seed.J[:, None] - other.J / ratio[..., None, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        across = dx[..., 0, None] * difference[..., 1, :] - dx[..., 1, None] * difference[..., 0, :]
-        across = across / length[..., None]
-    size = np.sqrt((seed.J**2).sum(axis=(1, 2)))[:, None]
-    confirmed = error <= 2 * PAIR_SLOPE * length + PAIR_OFFSET * radius
-    confirmed &= np.hypot(across[..., 0], across[..., 1]) <= PAIR_FRAME * size
-    confirmed &= (seed.detection[:, None] != other.detection) & (seed.point[:, None] != other.point)
-    return confirmed, error / np.maximum(length, 1e-300)
+    det_seed, det_other = _det(seed.J)[:, None], _det(other.J)
+    ratio = np.cbrt(det_other) / np.cbrt(det_seed)
+    (X, Y), (x, y) = (other.X.T[:, None] - seed.X.T[:, :, None]), (other.xy.T[:, None] - seed.xy.T[:, :, None])
+    (a, b), (c, d) = seed.J.transpose(1, 2, 0)[..., None]
+    error = np.hypot(ratio * (a * X + b * Y) - x, ratio * (c * X + d * Y) - y)
+    (a, b), (c, d) = other.J.transpose(1, 2, 0)
+    error += np.hypot((a * X + b * Y) / ratio - x, (c * X + d * Y) / ratio - y)
+    length = np.hypot(x, y)
+    near = error <= 2 * PAIR_SLOPE * length + PAIR_OFFSET * (np.sqrt(det_seed) + np.sqrt(det_other))
+    near &= (seed.detection[:, None] != other.detection) & (seed.point[:, None] != other.point) & (length > 0)
+    s, t = np.nonzero(near)
+    difference = seed.J[s] - other.J[t] / ratio[s, t, None, None]
+    across = (x[s, t, None] * difference[:, 1] - y[s, t, None] * difference[:, 0]) / length[s, t, None]
+    size = np.sqrt((seed.J[s] ** 2).sum(axis=(1, 2)))
+    near[s, t] = np.hypot(across[:, 0], across[:, 1]) <= PAIR_FRAME * size
+    return near, error / np.maximum(length, 1e-300)
 
 
 def _explain(candidates: Candidates, seeds: Int, limit: float) -> list[Explanation]:

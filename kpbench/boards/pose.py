@@ -24,8 +24,8 @@ SAME_POSE = 0.1
 """Two poses are one if the squared distance between them, in standard deviations, is smaller."""
 FLOOR_PX = 0.01
 """Added to the standard deviations of points."""
-LEAST_GAIN = 1e-6
-"""The refinement ends when the sums of squared errors fall by no more than this."""
+LEAST_GAIN = 1e-4
+"""The refinement ends when the sums of squared errors fall by no more than this part."""
 STEPS = 20
 """Largest number of steps of Levenberg and Marquardt."""
 
@@ -143,8 +143,9 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     frames = straighten(match.detections, camera)
     if not np.isfinite(frames.xy).all():
         raise DataError(f"{name}: the camera's lens shows no such points")
-    to_board = np.array([match.board.keypoints[n].H_patch2board[:2, :2] for n in match.points])
-    R, t = _initial_poses(X, frames.xy, frames.A @ np.linalg.inv(to_board), to_board)
+    points, _, to_patch = match.board.orientations
+    J = frames.A @ to_patch[np.searchsorted(points, match.points)]
+    R, t = _initial_poses(X, frames.xy, J, float(np.mean([k.diameter_mm for k in match.board.keypoints])) / 2)
     R, t, information, cost = _refine(R, t, X, frames.xy, _whitening(frames, camera))
     valid = np.isfinite(cost) & ((X @ R[:, 2, :, None])[..., 0] + t[:, 2:] > 0).all(axis=1)
     if not valid.any():
@@ -162,13 +163,12 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     return poses
 
 
-def _initial_poses(X: Float, xy: Float, J: Float, to_board: Float) -> tuple[Float, Float]:
+def _initial_poses(X: Float, xy: Float, J: Float, unit_mm: float) -> tuple[Float, Float]:
     """Return the two poses of the plane whose image is that of a homography to first order at the middle of the points.
 
     With ``v`` the ray of the middle and z its depth, ``J = B R₂₂ / z``, where R₂₂ is a part of the rotation in a frame
     whose axis is v, and ``B = [I, -v] Rv``. The greatest singular value of ``B⁻¹ J`` is 1 / z (Collins and Bartoli).
     """
-    unit_mm = float(np.sqrt(np.linalg.det(to_board)).mean())
     H = fit_homography(X[:, :2] / unit_mm, xy, J * unit_mm) @ np.diag([1, 1, unit_mm])
     middle = np.append(X[:, :2].mean(axis=0), 1.0)
     a, b, w = H @ middle
@@ -206,7 +206,7 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
         Y = turned + t[:, None]
         with np.errstate(all="ignore"):
             ray = Y[..., :2] / Y[..., 2:]
-            error = np.einsum("nij,knj->kni", whiten, rays - ray)
+            error = (whiten @ (rays - ray)[..., None])[..., 0]
         return error, np.concatenate([turned, Y], axis=-1)
 
     def cost_of(error: Float) -> Float:
@@ -216,10 +216,10 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
     cost, damping = cost_of(error), np.full(len(R), 1e-6)
     for _ in range(STEPS):
         J = _jacobian(points, whiten)
-        information = np.einsum("kmi,kmj->kij", J, J)
-        gradient = np.einsum("kmi,km->ki", J, error.reshape(len(R), -1))
-        damped = information + damping[:, None, None] * np.einsum("kii,ij->kij", information, np.eye(6))
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
+        transposed = J.transpose(0, 2, 1)
+        information = transposed @ J
+        damped = information * (1 + damping[:, None, None] * np.eye(6))
+        step = np.linalg.solve(damped, transposed @ error.reshape(len(R), -1, 1))[..., 0]
         R_new, t_new = _exp(step[:, :3]) @ R, t + step[:, 3:]
         error_new, points_new = errors(R_new, t_new)
         cost_new = cost_of(error_new)
@@ -230,10 +230,10 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
             np.where(better[:, None, None], new, old) for new, old in ((error_new, error), (points_new, points))
         )
         cost, damping = np.where(better, cost_new, cost), np.where(better, damping / 10, damping * 100)
-        if better.all() and (gain <= LEAST_GAIN).all():
+        if better.all() and (gain <= LEAST_GAIN * cost + 1e-12).all():
             break
     J = _jacobian(points, whiten)
-    return R, t, np.einsum("kmi,kmj->kij", J, J), cost
+    return R, t, J.transpose(0, 2, 1) @ J, cost
 
 
 def _jacobian(points: Float, whiten: Float) -> Float:
@@ -241,11 +241,11 @@ def _jacobian(points: Float, whiten: Float) -> Float:
     rx, ry, rz, x, y, z = np.moveaxis(points, -1, 0)
     inverse = 1 / z
     u, v = x * inverse, y * inverse
-    zero = np.zeros_like(z)
-    du = [-u * ry, rz + u * rx, -ry, np.ones_like(z), zero, -u]
-    dv = [-rz - v * ry, v * rx, rx, zero, np.ones_like(z), -v]
-    J = np.stack([np.stack(du, axis=-1), np.stack(dv, axis=-1)], axis=-2) * inverse[..., None, None]
-    return np.asarray(np.einsum("nij,knjl->knil", whiten, J).reshape(len(points), -1, 6))
+    J = np.zeros((*z.shape, 2, 6))
+    J[..., 0, 0], J[..., 0, 1], J[..., 0, 2], J[..., 0, 3], J[..., 0, 5] = -u * ry, rz + u * rx, -ry, 1.0, -u
+    J[..., 1, 0], J[..., 1, 1], J[..., 1, 2], J[..., 1, 4], J[..., 1, 5] = -rz - v * ry, v * rx, rx, 1.0, -v
+    J *= inverse[..., None, None]
+    return np.asarray(whiten @ J).reshape(len(points), -1, 6)
 
 
 def _exp(rotation_vector: Float) -> Float:

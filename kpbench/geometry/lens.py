@@ -133,6 +133,8 @@ class Lens:
             lens folds the image over at this ray.
         """
         seen = np.asarray(rays, np.float64).reshape(-1, 2)
+        if self.model == "brown" and not any(self.coefficients):
+            return seen.copy()
         found = self._from_angle(seen) if self.model == "fisheye" else self._newton(seen)
         error = np.abs(self.distort(found) - seen).max(axis=1) / np.maximum(1.0, np.abs(seen).max(axis=1))
         (a, b), (c, d) = self.jacobian(found).transpose(1, 2, 0)

@@ -12,7 +12,6 @@ from .design import load_patches as load_patches
 from .design import shipped_patches as shipped_patches
 from .symmetry import board_turns_deg as board_turns_deg
 from .symmetry import pose_problem as pose_problem
-from .symmetry import symmetry_order as symmetry_order
 from .tag_boards import TagBoard as TagBoard
 from .tag_boards import TagCorner as TagCorner
 from .tag_boards import tag_board as tag_board

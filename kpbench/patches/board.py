@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg, flatten
 from kpbench.geometry.spread import spread
 from kpbench.patches.design import Patch, unit_polygons
-from kpbench.types import Float
+from kpbench.types import Float, Int
 
 # In the paper, a disc is 16 px wide if its board covers 0.5 % of a 1624 x 1240 px image. A square board then has a side
 # of 100 px, so the diameter is 0.16 of the side.
@@ -194,6 +194,25 @@ class Board:
     def points_mm(self) -> Float:
         """Centres of the keypoints in mm of the board frame, ndarray of shape (N, 3) with z = 0."""
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
+
+    @cached_property
+    def orientations(self) -> tuple[Int, Float, Float]:
+        """Every keypoint in every rotation of its patch that leaves the print unchanged (point, turn, A_board2patch).
+
+        * ``point``, ndarray of shape (m,): index of the keypoint.
+        * ``turn``, ndarray of shape (m, 2, 2): the rotation, in the patch frame.
+        * ``A_board2patch``, ndarray of shape (m, 2, 2): the linear map from mm of the board frame to the patch frame
+          before this rotation.
+
+        A patch that looks the same in every direction has no row.
+        """
+        rows = [(n, k, turn) for n, k in enumerate(self.keypoints) for turn in range(k.patch.symmetry_order)]
+        turns = [cos_sin_deg(360.0 * turn / k.patch.symmetry_order) for _, k, turn in rows]
+        return (
+            np.array([n for n, _, _ in rows], np.int64),
+            np.array([[[c, -s], [s, c]] for c, s in turns]).reshape(-1, 2, 2),
+            np.array([np.linalg.inv(k.H_patch2board[:2, :2]) for _, k, _ in rows]).reshape(-1, 2, 2),
+        )
 
     def outlines(self, radius_px: Float, ink_gain: float = 0.0) -> tuple[list[list[Float]], list[list[Float]]]:
         """Return the outlines of all black ink, and of the whole patches, as polygons in mm of the board frame.

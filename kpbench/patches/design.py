@@ -183,6 +183,21 @@ class Patch:
         edges = angles[black[0] != np.roll(black[0], 1)]
         return len(np.unique(np.round(edges % 180.0, 6))) >= 2
 
+    @cached_property
+    def symmetry_order(self) -> int:
+        """Number of rotations within a full turn that leave the print unchanged.
+
+        The rotation by 0 degrees counts, so 1 means that the orientation is unique. 0 means that every rotation leaves
+        the print unchanged.
+        """
+        _, angles, black = self.cells
+        if len(angles) == 1:
+            return 0
+        width = np.diff(np.append(angles, angles[0] + 360.0))
+        shifts = range(len(angles))
+        same = (np.allclose(np.roll(width, k), width) and (np.roll(black, k, axis=1) == black).all() for k in shifts)
+        return int(sum(same))
+
     @property
     def digest(self) -> str:
         """SHA-256 of :attr:`cells`. Designs with the same digest have identical ink."""

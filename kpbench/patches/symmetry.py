@@ -1,36 +1,13 @@
-"""Rotations that leave a design or a board unchanged."""
+"""Rotations that leave a board unchanged, and boards whose pose is not unique."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from kpbench.patches.board import Board
-from kpbench.patches.design import Patch
 
 SAME_MM, SAME_DEG = 1e-3, 1e-3
 """Points and rotations that differ by less are the same."""
-
-
-def symmetry_order(patch: Patch) -> int:
-    """Return the number of rotations within a full turn that leave the print unchanged.
-
-    The rotation by 0 degrees counts, so 1 means that the orientation is unique. 0 means that every rotation leaves the
-    print unchanged.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> from kpbench.patches import symmetry_order
-    >>> [symmetry_order(patch) for patch in kpbench.shipped_patches()]
-    [2, 1, 1, 1]
-    """
-    _, angles, black = patch.cells
-    if len(angles) == 1:
-        return 0
-    width = np.diff(np.append(angles, angles[0] + 360.0))
-    shifts = range(len(angles))
-    same = (np.allclose(np.roll(width, k), width) and (np.roll(black, k, axis=1) == black).all() for k in shifts)
-    return int(sum(same))
 
 
 def board_turns_deg(board: Board) -> tuple[float, ...]:
@@ -48,7 +25,7 @@ def board_turns_deg(board: Board) -> tuple[float, ...]:
     """
     xy = board.points_mm[:, :2] - board.points_mm[:, :2].mean(axis=0)
     size = np.array([k.diameter_mm for k in board.keypoints])
-    order = np.array([symmetry_order(k.patch) for k in board.keypoints])
+    order = np.array([k.patch.symmetry_order for k in board.keypoints])
     patch_id = np.array([k.patch_id for k in board.keypoints])
     rotate_deg = np.array([k.rotate_deg for k in board.keypoints])
     distance, angle = np.hypot(*xy.T), np.degrees(np.arctan2(xy[:, 1], xy[:, 0]))

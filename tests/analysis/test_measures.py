@@ -27,7 +27,6 @@ from kpbench.analysis.natural_images import natural_response, sample_windows
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.coverage import rasterise
 from kpbench.patches.design import Patch, SemiCircle, unit_polygons
-from kpbench.patches.symmetry import symmetry_order
 
 DESIGNS = Path(__file__).parents[2] / "benchmarks" / "designs"
 ALTERNATIVES = kpbench.load_patches(sorted((DESIGNS / "alternatives").glob("*.toml")))
@@ -171,8 +170,8 @@ def test_distance_of_designs():
 
 
 def test_the_shipped_designs_tell_their_orientation_but_for_the_checker():
-    assert [symmetry_order(p) for p in kpbench.shipped_patches()] == [2, 1, 1, 1]
-    assert symmetry_order(Patch("disc", 0, "black", ())) == 0
+    assert [p.symmetry_order for p in kpbench.shipped_patches()] == [2, 1, 1, 1]
+    assert Patch("disc", 0, "black", ()).symmetry_order == 0
     turned = measured(["checker", "wheel"], turned_distance)
     assert turned[0] == pytest.approx(0.0, abs=1e-3)
     assert turned[1] > 0.1
