@@ -210,6 +210,11 @@ class Predictions:
         Identity of each point, 0 or more; None if the detector does not identify patches.
     A_patch2image, covariance, blur_px : ndarray with K rows, float64, or None
         As in :class:`Detections`. A covariance is symmetric and positive semi-definite.
+    board, points : ndarray of shape (K,), int64, or None
+        Number of the board that each detection is a part of, in ``boards``, and index of the board's keypoint; -1 for
+        none. A detection of a board whose points are ambiguous has a board and no point. Both are given or none.
+    boards : tuple of str
+        Names of the boards that were looked for.
     file : tuple of N str, or None
         Name of each image's file, as it was given; "" for none. All frames of a film have the name of the film.
     size : ndarray of shape (N, 2), int64, or None
@@ -262,6 +267,9 @@ class Predictions:
     frame_index: Int | None = None
     time_s: Float | None = None
     ms: Float | None = None
+    board: Int | None = None
+    points: Int | None = None
+    boards: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         assign = object.__setattr__
@@ -274,6 +282,9 @@ class Predictions:
         for name in ("A_patch2image", "covariance", "blur_px"):
             if getattr(self, name) is not None:
                 assign(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
+        for name in ("board", "points"):
+            if getattr(self, name) is not None:
+                assign(self, name, as_whole(name, getattr(self, name)))
         for name, unknown in UNKNOWN.items():
             values = getattr(self, name)
             if values is not None and name != "file":

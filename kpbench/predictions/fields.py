@@ -15,13 +15,16 @@ SCHEMA = "kpbench.predictions/2"
 """Name and version of the format of predictions files."""
 READ_SCHEMAS = ("kpbench.predictions/1", SCHEMA)
 """The formats that are read. Version 1 lacks the optional fields from ``A_patch2image`` on."""
-HEADER_KEYS = {"schema", "dataset", "fingerprint", "truth_digest", "detector"}
+HEADER_KEYS = {"schema", "dataset", "fingerprint", "truth_digest", "detector", "boards"}
 MATRIX_CELLS = {
     "A_patch2image": ("A_11", "A_12", "A_21", "A_22"),
     "covariance": ("covariance_xx", "covariance_xy", "covariance_yy"),
 }
 """Columns of CSV and Parquet for each matrix of a detection, by row. A covariance is symmetric."""
-DETECTION_CELLS = ("x", "y", "score", "id", *MATRIX_CELLS["A_patch2image"], *MATRIX_CELLS["covariance"], "blur_px")
+DETECTION_CELLS = (
+    *("x", "y", "score", "id", *MATRIX_CELLS["A_patch2image"], *MATRIX_CELLS["covariance"]),
+    *("blur_px", "board", "points"),
+)
 IMAGE_CELLS = ("file", "width", "height", "frame_index", "time_s", "ms")
 TABLE_COLUMNS = ("image_id", *DETECTION_CELLS, *IMAGE_CELLS)
 """Columns of CSV and Parquet; all but image_id, x and y are optional."""
@@ -34,6 +37,8 @@ H5_COLUMNS = {
     "A_patch2image": ("fiu", 3),
     "covariance": ("fiu", 3),
     "blur_px": ("fiu", 1),
+    "board": ("iu", 1),
+    "points": ("iu", 1),
     "file": ("S", 1),
     "size": ("iu", 2),
     "frame_index": ("iu", 1),
@@ -57,6 +62,8 @@ class ImageRecord(msgspec.Struct, gc=False, forbid_unknown_fields=True):
     A_patch2image: list[Matrix] | None = None
     covariance: list[Matrix] | None = None
     blur_px: list[float] | None = None
+    board: list[Int64] | None = None
+    points: list[Int64] | None = None
     file: str | None = None
     size: tuple[Side, Side] | None = None
     frame_index: Whole64 | None = None
@@ -69,6 +76,8 @@ EXPECTED_IN_RECORD = {
     "A_patch2image[]": "a matrix (2, 2) of finite numbers",
     "blur_px": "a list",
     "blur_px[]": "a finite number of 0 or more",
+    "board": "a list",
+    "board[]": "the number of one of the boards, or -1",
     "covariance": "a list",
     "covariance[]": "a symmetric, positive semi-definite matrix (2, 2) of finite numbers",
     "file": "a text",
@@ -79,6 +88,8 @@ EXPECTED_IN_RECORD = {
     "keypoints": "a list",
     "keypoints[]": "two finite numbers",
     "ms": "milliseconds, a finite number of 0 or more",
+    "points": "a list",
+    "points[]": "the index of a board's point, or -1",
     "scores": "a list",
     "scores[]": "a finite number",
     "size": "width and height in px, whole numbers over 0",
@@ -88,7 +99,8 @@ EXPECTED_IN_RECORD = {
 
 
 def parse_header(content: Any) -> dict[str, Any]:
-    """Check a decoded header, and return its ``detector``, ``dataset``, ``fingerprint`` and ``truth_digest``.
+    """Check a decoded header, and return its ``detector``, ``dataset``, ``fingerprint``, ``truth_digest``
+    and ``boards``.
 
     Raises
     ------
@@ -109,7 +121,10 @@ def parse_header(content: Any) -> dict[str, Any]:
     for name, digest in digests.items():
         if not isinstance(digest, str | None):
             raise PredictionsError(f"{name} is {json_type(digest)}, expected the {name.replace('_', ' ')} of a dataset")
-    return {"detector": detector, "dataset": dataset, **digests}
+    boards = content.get("boards", [])
+    if not isinstance(boards, list) or not all(isinstance(name, str) for name in boards):
+        raise PredictionsError(f"boards is {json_type(boards)}, expected a list of names")
+    return {"detector": detector, "dataset": dataset, **digests, "boards": tuple(boards)}
 
 
 def encode_names(predictions: Predictions) -> list[str] | None:
@@ -121,4 +136,6 @@ def make_header(predictions: Predictions) -> dict[str, Any]:
     """Return the header of predictions as a dict for JSON."""
     named = {name: getattr(predictions, name) for name in ("dataset", "fingerprint", "truth_digest")}
     header = {"schema": SCHEMA, **{k: v for k, v in named.items() if v is not None}, "detector": predictions.detector}
+    if predictions.boards:
+        header["boards"] = list(predictions.boards)
     return dict(escape_surrogates(header))

@@ -102,8 +102,9 @@ def read_jsonl(path: Path) -> Predictions:
             raise PredictionsError(str(error)) from None
 
 
-LISTS = {"scores": 1, "ids": 1, "A_patch2image": 3, "covariance": 3, "blur_px": 1}
+LISTS = {"scores": 1, "ids": 1, "A_patch2image": 3, "covariance": 3, "blur_px": 1, "board": 1, "points": 1}
 """Optional lists of a record with an entry per keypoint, and their depth."""
+WHOLE_LISTS = ("ids", "board", "points")
 IMAGE_DTYPES: dict[str, Any] = {"file": object, "size": "i8", "frame_index": "i8", "time_s": "f8", "ms": "f8"}
 
 
@@ -124,7 +125,7 @@ def _make_columns(batch: RecordBatch[ImageRecord]) -> dict[str, NDArray[Any]]:
             entries: Iterator[Any] = (values for values in lists if values)
             for _ in range(depth):
                 entries = chain.from_iterable(entries)
-            joined = np.fromiter(entries, np.int64 if name == "ids" else np.float64)
+            joined = np.fromiter(entries, np.int64 if name in WHOLE_LISTS else np.float64)
             columns[name] = joined.reshape(-1, *[2] * (depth - 1))
     for name, unknown in UNKNOWN.items():
         if name in batch.keys:

@@ -13,8 +13,15 @@ from kpbench.predictions.fields import DETECTION_CELLS, IMAGE_CELLS, MATRIX_CELL
 from kpbench.types import UNKNOWN, Float, Int, Predictions, offsets_of
 from kpbench.validity import InvalidValue
 
-ID_LIMITS = {"image_id": 2**63, "id": 2**53, "width": 2**31, "height": 2**31, "frame_index": 2**53}
+ID_LIMITS = {"image_id": 2**63, "id": 2**53, "board": 2**31, "points": 2**31}
+ID_LIMITS |= {"width": 2**31, "height": 2**31, "frame_index": 2**53}
 """Columns of whole numbers, and the least number that each cannot hold."""
+WHOLE_CELLS = {
+    "id": (0, "a patch id, a whole number of 0 or more"),
+    "board": (-1, "the number of one of the boards, or -1"),
+    "points": (-1, "the index of a board's point, or -1"),
+}
+"""Columns of whole numbers of a detection, their least value, and the expected value in words."""
 LEAST_OF_IMAGE = {
     "width": (1, "px, a whole number over 0"),
     "height": (1, "px, a whole number over 0"),
@@ -46,11 +53,11 @@ def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], pl
     rows = np.flatnonzero(~blank)
     for name in cells:
         column = table[name][rows]
-        valid = np.isfinite(column)
-        if name == "id":
-            valid &= (column >= 0) & (column == np.floor(column)) & (column < 2**53)
+        valid, expected = np.isfinite(column), "a finite number"
+        if name in WHOLE_CELLS:
+            least, expected = WHOLE_CELLS[name]
+            valid &= (column >= least) & (column == np.floor(column)) & (column < ID_LIMITS[name])
         if not valid.all():
-            expected = "a patch id, a whole number of 0 or more" if name == "id" else "a finite number"
             raise _bad_cell(table, name, int(rows[np.argmin(valid)]), place, expected)
     if len(table["image_id"]) and table["image_id"].min() < 0:
         row = int(np.argmax(table["image_id"] < 0))
@@ -66,6 +73,8 @@ def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], pl
             score=table["score"][rows] if "score" in table else np.ones(len(rows)),
             patch_id=table["id"][rows].astype(np.int64) if "id" in table else None,
             blur_px=table["blur_px"][rows] if "blur_px" in table else None,
+            board=table["board"][rows] if "board" in table else None,
+            points=table["points"][rows] if "points" in table else None,
             A_patch2image=_matrices(table, "A_patch2image", rows),
             covariance=_matrices(table, "covariance", rows),
             **_columns_of_images(table, image, place),
@@ -139,7 +148,7 @@ def make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
         if matrices is not None:
             places = (0, 1, 3) if len(names) == 3 else range(4)
             cells |= {cell: matrices.reshape(-1, 4)[:, k] for cell, k in zip(names, places, strict=True)}
-    for name, values in (cells | {"blur_px": p.blur_px}).items():
+    for name, values in (cells | {"blur_px": p.blur_px, "board": p.board, "points": p.points}).items():
         if values is not None:
             columns[name] = np.full(len(image), np.nan)
             columns[name][~blank] = values
@@ -156,11 +165,11 @@ def make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
 
 def require_column_names(names: list[str], place: str) -> list[str]:
     """Check the names of a table's columns, and return the names without blanks at the ends."""
-    together = (*MATRIX_CELLS.values(), ("width", "height"))
+    together = (*MATRIX_CELLS.values(), ("board", "points"), ("width", "height"))
     is_whole = all(len({*cells} & {*names}) in (0, len(cells)) for cells in together)
     if not {"image_id", "x", "y"} <= set(names) <= set(TABLE_COLUMNS) or len(set(names)) < len(names) or not is_whole:
         raise PredictionsError(
             f"{place} has columns {','.join(names)[:80]}, expected {','.join(TABLE_COLUMNS)} "
-            "(optional from score on; those of a matrix and of a size together)"
+            "(optional from score on; those of a matrix, of a board and of a size together)"
         )
     return names

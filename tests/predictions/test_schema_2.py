@@ -13,8 +13,8 @@ from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.types import UNKNOWN, Detections, Predictions
 
 FORMATS = ["json", "jsonl", "csv", "parquet", "h5"]
-OF_DETECTIONS = ("A_patch2image", "covariance", "blur_px")
-HEADER = {"schema": "kpbench.predictions/2"}
+OF_DETECTIONS = ("A_patch2image", "covariance", "blur_px", "board", "points")
+HEADER = {"schema": "kpbench.predictions/2", "boards": ["hexagon-chécker", "b"]}
 
 
 def some(n=12, seed=0, **change):
@@ -27,6 +27,9 @@ def some(n=12, seed=0, **change):
         "A_patch2image": rng.normal(0, 20, (k, 2, 2)),
         "covariance": root @ root.transpose(0, 2, 1),
         "blur_px": rng.random(k),
+        "board": np.where(np.arange(k) % 4 == 1, -1, 1),
+        "points": np.where(np.arange(k) % 4, -1, np.arange(k)),
+        "boards": ("hexagon-chécker", "b"),
         "file": tuple(f"ünï,{i}: a.png" if i % 3 else "" for i in range(n)),
         "size": np.where(np.arange(n)[:, None] == 1, 0, rng.integers(1, 5000, (n, 2))),
         "frame_index": rng.integers(-1, 2**40, n),

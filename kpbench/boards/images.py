@@ -1,0 +1,184 @@
+"""Boards in the detections of many images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from kpbench.boards.matching import BoardMatch, find_board
+from kpbench.boards.pose import BoardPose, estimate_pose
+from kpbench.errors import DataError
+from kpbench.geometry.camera import Camera
+from kpbench.patches.board import Board
+from kpbench.types import Detections, Predictions
+
+NOT_FOUND = "the board was not found"
+
+
+@dataclass(frozen=True)
+class PoseRecord:
+    """What is known of one board in one image.
+
+    Attributes
+    ----------
+    image_id : int
+    file : str
+        Name of the image's file; "" if unknown.
+    frame_index : int or None
+    time_s : float or None
+    board : str
+        Name of the board.
+    pose : BoardPose or None
+        None if there is no pose.
+    reason : str
+        Why there is no pose; "" if there is one.
+
+    Examples
+    --------
+    >>> from kpbench.boards import PoseRecord
+    >>> PoseRecord(0, "a.png", None, None, "hexagon-trefoil", None, "the board was not found").pose is None
+    True
+    """
+
+    image_id: int
+    file: str
+    frame_index: int | None
+    time_s: float | None
+    board: str
+    pose: BoardPose | None
+    reason: str
+
+
+def find_boards(
+    detections: Detections, boards: Sequence[Board], camera: Camera | None = None
+) -> tuple[tuple[BoardMatch, ...], ...]:
+    """Find several boards in one image.
+
+    If two boards explain one detection, the match with more points counts. With as many points, both matches are
+    alternatives of each other, and are therefore ambiguous.
+
+    Parameters
+    ----------
+    detections, camera
+        As for :func:`find_board`.
+    boards : sequence of Board
+
+    Returns
+    -------
+    tuple of tuple of BoardMatch
+        The matches of each board.
+
+    Raises
+    ------
+    DataError
+        As :func:`find_board`.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> boards = [kpbench.hexagon_board(patch, 187.5) for patch in kpbench.shipped_patches()]
+    >>> nothing = kpbench.Detections([], [], [], [[[]]][:0])  # doctest: +SKIP
+    """
+    found = [(n, match) for n, board in enumerate(boards) for match in find_board(detections, board, camera)]
+    found.sort(key=lambda item: -len(item[1].points))
+    kept = list[tuple[int, BoardMatch]]()
+    for n, match in found:
+        rivals = [k for k, (_, other) in enumerate(kept) if np.isin(match.index, other.index).any()]
+        equal = [k for k in rivals if len(kept[k][1].points) == len(match.points)]
+        if len(rivals) > len(equal):
+            continue
+        for k in equal:
+            m, other = kept[k]
+            kept[k] = (m, replace(other, alternatives=(*other.alternatives, replace(match, alternatives=()))))
+            match = replace(match, alternatives=(*match.alternatives, replace(other, alternatives=())))
+        kept.append((n, match))
+    return tuple(tuple(match for m, match in kept if m == n) for n in range(len(boards)))
+
+
+def locate_boards(
+    predictions: Predictions, boards: Sequence[Board], camera: Camera | None = None
+) -> tuple[Predictions, list[PoseRecord]]:
+    """Find boards and their poses in the detections of many images.
+
+    Parameters
+    ----------
+    predictions : Predictions
+        With identities and affine frames.
+    boards : sequence of Board
+        Their names differ.
+    camera : Camera, optional
+        Camera of all images. Without a camera, there are no poses.
+
+    Returns
+    -------
+    Predictions
+        With the columns ``board`` and ``points``. A match whose points are ambiguous has no points.
+    list of PoseRecord
+        For each image and board one record, or one per copy of the board.
+
+    Raises
+    ------
+    DataError
+        If two boards have one name, an image has another size than the camera and no whole-number multiple or fraction
+        of it, or the detections have no identities or no affine frames.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import kpbench
+    >>> from kpbench.boards import locate_boards
+    >>> board = kpbench.grid_board(kpbench.shipped_patches(), rows=2, columns=2, diameter_mm=20.0, pitch_mm=40.0)
+    >>> ids = [k.patch_id for k in board.keypoints]
+    >>> frames = np.tile(30 * np.eye(2), (4, 1, 1))
+    >>> found = kpbench.Detections(3 * board.points_mm[:, :2] + [320, 240], np.ones(4), ids, frames)
+    >>> located, poses = locate_boards(kpbench.Predictions.from_detections([found]), [board])
+    >>> located.points.tolist(), poses[0].reason
+    ([0, 1, 2, 3], 'there is no camera')
+    """
+    names = [board.name for board in boards]
+    if doubles := [name for name in names if names.count(name) > 1]:
+        raise DataError(f"two boards have the name {doubles[0]!r}")
+    board_of, points = np.full(len(predictions.xy), -1), np.full(len(predictions.xy), -1)
+    records = list[PoseRecord]()
+    for n, (detections, (first, _)) in enumerate(
+        zip(predictions.detections(), pairwise(predictions.offsets.tolist()), strict=True)
+    ):
+        of_image = _camera_of(predictions, n, camera)
+        found = find_boards(detections, boards, of_image) if len(detections) else tuple(() for _ in boards)
+        for k, matches in enumerate(found):
+            for match in matches:
+                board_of[first + match.index] = k
+                points[first + match.index] = -1 if match.ambiguous else match.points
+            records += [_record(predictions, n, names[k], match, of_image) for match in matches or (None,)]
+    return replace(predictions, board=board_of, points=points, boards=tuple(names)), records
+
+
+def name_image(predictions: Predictions, n: int) -> str:
+    """Return the name of an image for a message: its file, or its ID."""
+    file = predictions.file[n] if predictions.file is not None else ""
+    return file or f"image_id {predictions.image_id[n]}"
+
+
+def _camera_of(predictions: Predictions, n: int, camera: Camera | None) -> Camera | None:
+    """Return the camera for the size of an image."""
+    if camera is None or predictions.size is None or not predictions.size[n].all():
+        return camera
+    try:
+        return camera.at_size(*predictions.size[n].tolist())
+    except DataError as error:
+        raise DataError(f"{name_image(predictions, n)}: {error}") from None
+
+
+def _record(p: Predictions, n: int, board: str, match: BoardMatch | None, camera: Camera | None) -> PoseRecord:
+    pose, reason = None, NOT_FOUND
+    if match is not None:
+        try:
+            pose, reason = (None, "there is no camera") if camera is None else (estimate_pose(match, camera), "")
+        except DataError as error:
+            reason = str(error).removeprefix(f"board {board!r}: ")
+    frame = None if p.frame_index is None or p.frame_index[n] < 0 else int(p.frame_index[n])
+    time_s = None if p.time_s is None or np.isnan(p.time_s[n]) else float(p.time_s[n])
+    return PoseRecord(int(p.image_id[n]), p.file[n] if p.file is not None else "", frame, time_s, board, pose, reason)

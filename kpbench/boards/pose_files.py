@@ -1,0 +1,133 @@
+"""Files of poses: CSV and JSON lines, one line per image and board."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from kpbench.boards.images import PoseRecord
+from kpbench.boards.pose import BoardPose
+from kpbench.errors import DataError
+from kpbench.files import encode_utf8
+from kpbench.text import escape_csv
+from kpbench.writing import require_writable, write_file
+
+POSES_SCHEMA = "kpbench.poses/1"
+"""Name and version of the format of files of poses."""
+POSE_SUFFIXES = (".csv", ".jsonl")
+"""Ends of the names of files of poses."""
+MATRIX_COLUMNS = [f"rotation_{i}{j}" for i in "123" for j in "123"]
+COVARIANCE_COLUMNS = [f"covariance_{i}{j}" for i in "123456" for j in "123456" if j >= i]
+POSE_COLUMNS = (
+    *("image_id", "file", "frame_index", "time_s", "board", *MATRIX_COLUMNS),
+    *("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm", *COVARIANCE_COLUMNS),
+    *("reprojection_rms_px", "points", "ambiguous"),
+    *("second_qx", "second_qy", "second_qz", "second_qw", "second_tx_mm", "second_ty_mm", "second_tz_mm"),
+    *("state", "reason"),
+)
+"""Columns of a CSV file. A covariance is symmetric: its upper triangle is listed."""
+
+
+def require_poses_path(path: str | Path) -> Path:
+    """Refuse a path to which poses cannot be written, before any work is done.
+
+    Raises
+    ------
+    DataError
+        If the path ends in neither .csv nor .jsonl, cannot be written, or is a file other than poses by kpbench.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in POSE_SUFFIXES:
+        raise DataError(f"{path}: unknown kind of poses file, expected {' or '.join(POSE_SUFFIXES)}")
+    require_writable(path, "poses")
+    return path
+
+
+def write_poses(path: str | Path, records: Sequence[PoseRecord]) -> None:
+    """Write poses to a file, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        File ending in .csv or .jsonl.
+    records : sequence of PoseRecord
+        From :func:`locate_boards`.
+
+    Raises
+    ------
+    DataError
+        If the path has another suffix, or the file cannot be written.
+
+    Examples
+    --------
+    >>> from kpbench.boards import PoseRecord, write_poses
+    >>> write_poses("poses.jsonl", [PoseRecord(0, "a.png", None, None, "grid", None, "the board was not found")])
+    """
+    path = require_poses_path(path)
+    if path.suffix.lower() == ".csv":
+        write_file(path, _encode_csv(records))
+    else:
+        lines = [json.dumps({"schema": POSES_SCHEMA}), *(json.dumps(_to_dict(record)) for record in records), ""]
+        write_file(path, "\n".join(lines).encode())
+
+
+def _to_dict(record: PoseRecord) -> dict[str, Any]:
+    pose = record.pose
+    content: dict[str, Any] = {
+        "image_id": record.image_id,
+        "file": encode_utf8(record.file).decode() or None,
+        "frame_index": record.frame_index,
+        "time_s": record.time_s,
+        "board": record.board,
+        "rotation": None,
+    }
+    if pose is not None:
+        content |= {
+            **_motion(pose),
+            "covariance": pose.covariance.tolist(),
+            "reprojection_rms_px": pose.reprojection_rms_px,
+            "points": pose.points,
+            "ambiguous": pose.ambiguous,
+            "second": None if pose.second is None else _motion(pose.second),
+            "state": "seen",
+        }
+    return content | {"reason": record.reason or None}
+
+
+def _motion(pose: BoardPose) -> dict[str, Any]:
+    return {
+        "rotation": pose.rotation.tolist(),
+        "quaternion_xyzw": pose.quaternion_xyzw.tolist(),
+        "translation_mm": pose.translation_mm.tolist(),
+    }
+
+
+def _encode_csv(records: Sequence[PoseRecord]) -> bytes:
+    text = io.StringIO()
+    text.write(f"# {json.dumps({'schema': POSES_SCHEMA})}\n")
+    writer = csv.DictWriter(text, POSE_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for record in records:
+        content = _to_dict(record)
+        row = {name: content.get(name) for name in POSE_COLUMNS}
+        row |= {"file": escape_csv(content["file"] or ""), "board": escape_csv(record.board)}
+        if record.pose is not None:
+            row |= dict(zip(MATRIX_COLUMNS, record.pose.rotation.ravel().tolist(), strict=True))
+            upper = [v for k, line in enumerate(content["covariance"]) for v in line[k:]]
+            row |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+            row |= _flatten(content, "") | _flatten(content["second"], "second_")
+            row["ambiguous"] = int(record.pose.ambiguous)
+        writer.writerow(row)
+    return encode_utf8(text.getvalue())
+
+
+def _flatten(motion: dict[str, Any] | None, prefix: str) -> dict[str, float]:
+    if motion is None:
+        return {}
+    names = ("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm")
+    values = [*motion["quaternion_xyzw"], *motion["translation_mm"]]
+    return {f"{prefix}{name}": value for name, value in zip(names, values, strict=True)}
