@@ -71,7 +71,8 @@ def fit_homography(points: Float, xy: Float, J: Float) -> Float:
     """Fit a homography to points and to its derivatives at these points, by linear least squares.
 
     Each point gives the equations ``a + B X - x (1 + cᵀ X) = 0`` and ``B - x cᵀ - J (1 + cᵀ X) = 0``, in which a point
-    and a frame that are wrong by the same part of the disc's radius weigh the same. One point determines an affine map, two points a homography.
+    and a frame that are wrong by the same part of the disc's radius weigh the same. One point determines an affine map,
+    two points a homography.
 
     Parameters
     ----------

@@ -78,9 +78,14 @@ def find_boards(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import kpbench
-    >>> boards = [kpbench.hexagon_board(patch, 187.5) for patch in kpbench.shipped_patches()]
-    >>> nothing = kpbench.Detections([], [], [], [[[]]][:0])  # doctest: +SKIP
+    >>> from kpbench.boards import find_boards
+    >>> small, large = (kpbench.hexagon_board(kpbench.shipped_patches()[1], side) for side in (100.0, 200.0))
+    >>> frames = np.tile(16 * np.eye(2), (6, 1, 1))
+    >>> found = kpbench.Detections(2 * small.points_mm[:, :2] + 200, np.ones(6), np.ones(6, int), frames)
+    >>> [[match.ambiguous for match in matches] for matches in find_boards(found, [small, large])]
+    [[True], [True]]
     """
     found = [(n, match) for n, board in enumerate(boards) for match in find_board(detections, board, camera)]
     found.sort(key=lambda item: -len(item[1].points))
@@ -160,6 +165,18 @@ def name_image(predictions: Predictions, n: int) -> str:
     """Return the name of an image for a message: its file, or its ID."""
     file = predictions.file[n] if predictions.file is not None else ""
     return file or f"image_id {predictions.image_id[n]}"
+
+
+def require_camera_size(predictions: Predictions, camera: Camera | None) -> None:
+    """Refuse images whose size is no whole-number multiple or fraction of the camera's.
+
+    Raises
+    ------
+    DataError
+        At the first such image.
+    """
+    for n in range(len(predictions)):
+        _camera_of(predictions, n, camera)
 
 
 def _camera_of(predictions: Predictions, n: int, camera: Camera | None) -> Camera | None:

@@ -3,8 +3,8 @@
 1. Each detection may be each point of its ID, in each rotation that leaves its design unchanged: a candidate. It gives
    the derivative J of the homography from the board to the image.
 2. Two candidates confirm each other if one homography explains both. Along a line, a homography moves points by
-   ``H(X₂) - H(X₁) = λ J₁ (X₂ - X₁)`` with ``λ = (det J₂ / det J₁)^(1/3)``, and ``J₁ - J₂ / λ`` is of rank 1, with columns
-   parallel to this line.
+   ``H(X₂) - H(X₁) = λ J₁ (X₂ - X₁)`` with ``λ = (det J₂ / det J₁)^(1/3)``, and ``J₁ - J₂ / λ`` is of rank 1, with
+   columns parallel to this line.
 3. From a candidate with enough confirmations, a homography is fitted, and fitted again with all detections that it
    explains.
 4. Every set of points that explains as many of the same detections as the best one is an alternative.
@@ -23,17 +23,17 @@ from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
 from kpbench.types import Detections, Float, Int
 
-LEAST_POINTS = 3
+LEAST_MATCHED = 3
 """Smallest number of detections that make a board."""
 PAIR_SLOPE, PAIR_OFFSET, PAIR_FRAME = 0.15, 0.3, 0.2
-"""Two candidates confirm each other up to an error of ``PAIR_SLOPE`` times their distance plus ``PAIR_OFFSET`` radii, and
-up to a relative error ``PAIR_FRAME`` of their frames."""
-POINT_ERROR, POINT_ERROR_BENT = 0.2, 0.35
+"""Two candidates confirm each other up to an error of ``PAIR_SLOPE`` times their distance plus ``PAIR_OFFSET`` radii,
+and up to a relative error ``PAIR_FRAME`` of their frames."""
+MOST_OFF, MOST_OFF_BENT = 0.2, 0.35
 """Largest distance of a detection from its point on the board, in disc radii: with a camera, and without one."""
-FRAME_ERROR = 0.35
+MOST_TURNED = 0.35
 """Largest difference of a frame from its prediction, as Frobenius norm relative to the disc."""
-FIRST_ERROR = 0.8
-"""``POINT_ERROR`` of the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
+MOST_OFF_FIRST = 0.8
+"""``MOST_OFF`` of the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
 SIGMA = 0.02
 """Standard deviation of the errors of points and of entries of frames, in disc radii, for comparing alternatives."""
 EXCLUDED = 50.0
@@ -84,7 +84,7 @@ class BoardMatch:
 
 
 @dataclass(frozen=True)
-class Candidates:
+class PointCandidates:
     """S candidates: a detection, a point of the board, and the derivative J of the homography that they give.
 
     The board's unit is the mean radius of its discs. ``turn`` (S, 2, 2) rotates the frame of the detection.
@@ -97,16 +97,17 @@ class Candidates:
     X: Float
     J: Float
 
-    def __getitem__(self, rows: Int) -> Candidates:
-        columns = (self.detection, self.point, self.turn, self.xy, self.X, self.J)
-        return Candidates(*(column[rows] for column in columns))
+    def __getitem__(self, rows: Int) -> PointCandidates:
+        return PointCandidates(
+            self.detection[rows], self.point[rows], self.turn[rows], self.xy[rows], self.X[rows], self.J[rows]
+        )
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Candidates that one homography explains, by detection, and the sum of their squared errors."""
+    """PointCandidates that one homography explains, by detection, and the sum of their squared errors."""
 
-    candidates: Candidates
+    candidates: PointCandidates
     cost: float
 
     @property
@@ -159,11 +160,11 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
     if detections.patch_id is None:
         raise DataError("the detector gives no patch IDs, which a board needs")
     frames = straighten(detections, camera)
-    limit = POINT_ERROR_BENT if camera is None else POINT_ERROR
+    limit = MOST_OFF_BENT if camera is None else MOST_OFF
     candidates = _make_candidates(frames, detections.patch_id, board)
     explanations, left = list[Explanation](), np.argsort(-detections.score, kind="stable")
     left = left[np.isin(left, candidates.detection)]
-    while len(left) >= LEAST_POINTS:
+    while len(left) >= LEAST_MATCHED:
         per_detection = np.bincount(candidates.detection, minlength=len(detections))[left]
         count = max(1, int(np.searchsorted(np.cumsum(per_detection) * len(candidates.detection), MOST_PAIRS)))
         seeds = np.flatnonzero(np.isin(candidates.detection, left[:count]))
@@ -174,7 +175,7 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
     return _choose(explanations, detections, board)
 
 
-def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> Candidates:
+def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> PointCandidates:
     """Return every pair of a detection and a point of its ID, in every rotation that leaves the design unchanged."""
     for k in board.keypoints:
         if not k.patch.symmetry_order:
@@ -186,7 +187,7 @@ def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> Candidates:
     detection, row = np.nonzero((patch_id[:, None] == ids[points]) & usable[:, None])
     J = unit_mm * frames.A[detection] @ turns[row] @ to_patch[row]
     X = board.points_mm[points[row], :2] / unit_mm
-    return Candidates(detection, points[row], turns[row], frames.xy[detection], X, J)
+    return PointCandidates(detection, points[row], turns[row], frames.xy[detection], X, J)
 
 
 def _det(matrices: Float) -> Float:
@@ -194,7 +195,7 @@ def _det(matrices: Float) -> Float:
     return np.asarray(matrices[:, 0, 0] * matrices[:, 1, 1] - matrices[:, 0, 1] * matrices[:, 1, 0])
 
 
-def _confirm(seed: Candidates, other: Candidates) -> tuple[NDArray[np.bool_], Float]:
+def _confirm(seed: PointCandidates, other: PointCandidates) -> tuple[NDArray[np.bool_], Float]:
     """Return which candidates confirm each other, (S, T), and the relative errors of their distances, (S, T)."""
     det_seed, det_other = _det(seed.J)[:, None], _det(other.J)
     ratio = np.cbrt(det_other) / np.cbrt(det_seed)
@@ -214,7 +215,7 @@ def _confirm(seed: Candidates, other: Candidates) -> tuple[NDArray[np.bool_], Fl
     return near, error / np.maximum(length, 1e-300)
 
 
-def _explain(candidates: Candidates, seeds: Int, limit: float) -> list[Explanation]:
+def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Explanation]:
     """Return explanations that begin with some of the candidates, each once."""
     confirmed, error = _confirm(candidates[seeds], candidates)
     of_detection = candidates.detection == np.arange(candidates.detection.max(initial=0) + 1)[:, None]
@@ -223,7 +224,7 @@ def _explain(candidates: Candidates, seeds: Int, limit: float) -> list[Explanati
     for s in np.argsort(-support, kind="stable").tolist():
         seed = int(seeds[s])
         size = support[s] + 1
-        if size < LEAST_POINTS:
+        if size < LEAST_MATCHED:
             break
         if seed in used or size < 0.6 * best[candidates.detection[seed]]:
             continue
@@ -240,7 +241,7 @@ def _explain(candidates: Candidates, seeds: Int, limit: float) -> list[Explanati
     return found
 
 
-def _unique(candidates: Candidates, rows: Int, error: Float) -> Int:
+def _unique(candidates: PointCandidates, rows: Int, error: Float) -> Int:
     """Return some of the rows, least error first, so that each detection and each point occurs once."""
     kept, detections, points = list[int](), set[int](), set[int]()
     for row in rows[np.argsort(error[rows], kind="stable")].tolist():
@@ -252,14 +253,14 @@ def _unique(candidates: Candidates, rows: Int, error: Float) -> Int:
     return np.array(kept, np.int64)
 
 
-def _fit(candidates: Candidates, rows: Int, limit: float) -> tuple[Int, float] | None:
+def _fit(candidates: PointCandidates, rows: Int, limit: float) -> tuple[Int, float] | None:
     """Fit a homography to candidates, then to all that it explains, until they stay. Return them and their cost."""
-    for largest in (FIRST_ERROR, limit, limit, limit):
+    for largest in (MOST_OFF_FIRST, limit, limit, limit):
         H = fit_homography(candidates.X[rows], candidates.xy[rows], candidates.J[rows])
         point_error, frame_error = _errors(H, candidates)
-        near = np.flatnonzero((point_error <= largest) & (frame_error <= FRAME_ERROR))
+        near = np.flatnonzero((point_error <= largest) & (frame_error <= MOST_TURNED))
         before, rows = rows, _unique(candidates, near, point_error)
-        if len(rows) < LEAST_POINTS:
+        if len(rows) < LEAST_MATCHED:
             return None
         if largest == limit and {*before.tolist()} == {*rows.tolist()}:
             break
@@ -267,7 +268,7 @@ def _fit(candidates: Candidates, rows: Int, limit: float) -> tuple[Int, float] |
     return rows, float(cost)
 
 
-def _errors(H: Float, candidates: Candidates) -> tuple[Float, Float]:
+def _errors(H: Float, candidates: PointCandidates) -> tuple[Float, Float]:
     """Return the errors of points and frames, in disc radii, of all candidates under a homography.
 
     Both are measured on the board; inf for a candidate that the homography cannot show.

@@ -14,7 +14,7 @@ from kpbench.types import Float
 
 LEAST_POSE_POINTS = 4
 """Smallest number of points that determine the pose of a plane."""
-LEAST_SPREAD = 0.02
+LEAST_ASIDE = 0.02
 """Smallest extent of the points across their main direction, relative to the extent along it."""
 LEAST_SIGMA_PX = 0.05
 """Least standard deviation of a point that residuals may give."""
@@ -52,7 +52,7 @@ class BoardPose:
     ambiguous : bool
         Whether another pose explains the image as well.
     second : BoardPose or None
-        The other pose, if the pose is ambiguous. Its own ``second`` is None.
+        Another pose that explains the image as well, if there is one. Its own ``second`` is None.
 
     Examples
     --------
@@ -128,8 +128,9 @@ def estimate_pose(match: BoardMatch, camera: Camera) -> BoardPose:
     ([0.0, 0.0, 350.0], False)
     """
     first = _solve(match, camera)
-    rest = [*first[1:], *(pose for other in match.alternatives[:1] for pose in _solve(other, camera)[:1])]
-    return replace(first[0], ambiguous=bool(rest), second=rest[-1] if rest else None)
+    others = [other for other in match.alternatives if other.board is match.board]
+    rest = [_solve(other, camera)[0] for other in others[:1]] or first[1:]
+    return replace(first[0], ambiguous=bool(rest) or match.ambiguous, second=rest[0] if rest else None)
 
 
 def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
@@ -138,7 +139,7 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     if len(X) < LEAST_POSE_POINTS:
         raise DataError(f"{name}: {len(X)} points, expected at least {LEAST_POSE_POINTS} for a pose")
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
-    if extent[1] < LEAST_SPREAD * extent[0]:
+    if extent[1] < LEAST_ASIDE * extent[0]:
         raise DataError(f"{name}: {len(X)} points on one line, expected some beside it for a pose")
     frames = straighten(match.detections, camera)
     if not np.isfinite(frames.xy).all():
@@ -219,7 +220,7 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
         transposed = J.transpose(0, 2, 1)
         information = transposed @ J
         damped = information * (1 + damping[:, None, None] * np.eye(6))
-        step = np.linalg.solve(damped, transposed @ error.reshape(len(R), -1, 1))[..., 0]
+        step = np.asarray(np.linalg.solve(damped, transposed @ error.reshape(len(R), -1, 1))[..., 0], np.float64)
         R_new, t_new = _exp(step[:, :3]) @ R, t + step[:, 3:]
         error_new, points_new = errors(R_new, t_new)
         cost_new = cost_of(error_new)
@@ -280,9 +281,7 @@ def pose_distance(first: BoardPose, second: BoardPose) -> float:
     >>> pose_distance(pose, BoardPose(np.eye(3), np.array([0.0, 3.0, 500.0]), np.eye(6), 0.1, 6))
     9.0
     """
-    error = np.append(
-        rotation_vector(second.rotation @ first.rotation.T), second.translation_mm - first.translation_mm
-    )
+    error = np.append(rotation_vector(second.rotation @ first.rotation.T), second.translation_mm - first.translation_mm)
     return float(error @ np.linalg.solve(first.covariance, error))
 
 

@@ -22,6 +22,8 @@ POSE_SUFFIXES = (".csv", ".jsonl")
 """Ends of the names of files of poses."""
 MATRIX_COLUMNS = [f"rotation_{i}{j}" for i in "123" for j in "123"]
 COVARIANCE_COLUMNS = [f"covariance_{i}{j}" for i in "123456" for j in "123456" if j >= i]
+MOTION_KEYS = ("rotation", "quaternion_xyzw", "translation_mm")
+OTHER_KEYS = ("covariance", "reprojection_rms_px", "points", "ambiguous", "second", "state")
 POSE_COLUMNS = (
     *("image_id", "file", "frame_index", "time_s", "board", *MATRIX_COLUMNS),
     *("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm", *COVARIANCE_COLUMNS),
@@ -83,7 +85,7 @@ def _to_dict(record: PoseRecord) -> dict[str, Any]:
         "frame_index": record.frame_index,
         "time_s": record.time_s,
         "board": record.board,
-        "rotation": None,
+        **dict.fromkeys((*MOTION_KEYS, *OTHER_KEYS)),
     }
     if pose is not None:
         content |= {
@@ -99,11 +101,7 @@ def _to_dict(record: PoseRecord) -> dict[str, Any]:
 
 
 def _motion(pose: BoardPose) -> dict[str, Any]:
-    return {
-        "rotation": pose.rotation.tolist(),
-        "quaternion_xyzw": pose.quaternion_xyzw.tolist(),
-        "translation_mm": pose.translation_mm.tolist(),
-    }
+    return {name: getattr(pose, name).tolist() for name in MOTION_KEYS}
 
 
 def _encode_csv(records: Sequence[PoseRecord]) -> bytes:

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from kpbench.cli.messages import echo
+from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import Finite, Two
-
-if TYPE_CHECKING:
-    from kpbench.patches.board import Board
-    from kpbench.patches.design import Patch
 
 
 @click.command("render-patches")
@@ -104,8 +99,9 @@ def render_patches(
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
-    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch
+    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch, load_boards
     from kpbench.patches.design import load_patches, shipped_patches
+    from kpbench.patches.symmetry import pose_problem
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
     from kpbench.printing.sidecar import correct_sidecars
@@ -119,7 +115,7 @@ def render_patches(
     patches = load_patches(designs) if designs else shipped_patches()
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
-    boards = _boards(board, patches, bool(designs), diameter_mm) if board is not None else ()
+    boards = load_boards(board, patches if designs or chosen else None, diameter_mm) if board is not None else ()
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
     layout: dict[str, Any] = {"page": parse_page_format(page, landscape, not no_labels, mirror, invert), "dpi": dpi}
     with progress_bar(len(boards) or 1, "print", unit="sheet", shown=png) as progress:
@@ -130,6 +126,9 @@ def render_patches(
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
     for path in files:
         echo(path)
+    for printed in boards:
+        if problem := pose_problem(printed):
+            print_warning(f"the pose of board {printed.name} is not unique: {problem}")
     echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
 
 
@@ -143,19 +142,3 @@ def _check_usage(given: set[str], board: str | None) -> None:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
     if board not in (None, "hexagon", "grid") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")
-
-
-def _boards(name: str, patches: Sequence[Patch], own: bool, diameter_mm: float | None) -> list[Board]:
-    """Make the boards that --board asks for: a hexagon per design, one grid, or the board of a file."""
-    from kpbench.errors import DesignError
-    from kpbench.patches.board import HEXAGON_DIAMETER, grid_board, hexagon_board
-    from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, GRID_PITCH, load_board
-
-    diameter = diameter_mm or DEFAULT_DIAMETER_MM
-    if name == "hexagon":
-        return [hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in patches]
-    if name == "grid":
-        return [grid_board(patches, 4, 3, diameter, GRID_PITCH * diameter)]
-    if not Path(name).is_file():
-        raise DesignError(f"{name}: no such file, expected hexagon, grid or a board's TOML file")
-    return [load_board(name, patches if own else None, diameter_mm)]

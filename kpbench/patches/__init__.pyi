@@ -6,6 +6,7 @@ from .board import grid_board as grid_board
 from .board import hexagon_board as hexagon_board
 from .board_file import find_patch as find_patch
 from .board_file import load_board as load_board
+from .board_file import load_boards as load_boards
 from .design import Patch as Patch
 from .design import SemiCircle as SemiCircle
 from .design import load_patches as load_patches

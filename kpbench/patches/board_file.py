@@ -1,4 +1,4 @@
-"""Read boards from TOML files. A file describes a grid of designs, or a list of keypoints."""
+"""Read boards from files, or make them by name. A TOML file describes a grid of designs, or a list of keypoints."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.errors import DesignError
-from kpbench.patches.board import Board, BoardKeypoint, grid_board
+from kpbench.patches.board import HEXAGON_DIAMETER, Board, BoardKeypoint, grid_board, hexagon_board
+from kpbench.patches.board_sidecar import read_board_sidecar
 from kpbench.patches.design import Patch, load_patches, shipped_patches
 from kpbench.toml import TomlTable, name_source, read_toml
 
@@ -50,23 +51,27 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
 
 
 def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None) -> Board:
-    """Read a board from a TOML file. The file has one ``[grid]``, or at least one ``[[keypoint]]``, and not both.
+    """Read a board from a TOML file, or from the JSON sidecar of its print.
+
+    A TOML file has one ``[grid]``, or at least one ``[[keypoint]]``, and not both.
 
     Parameters
     ----------
     path : str or Path
     patches : sequence of Patch, optional
         Designs that the board may use. Default: the designs in the files that the key ``designs`` lists, with paths
-        relative to the folder of the board's file. If the key is missing, the default is the shipped designs.
+        relative to the folder of the board's file. If the key is missing, the default is the shipped designs. A
+        sidecar may always use the shipped designs.
     diameter_mm : float, optional
         Diameter of each disc whose diameter is not set in the file. Default: 30.
 
     Raises
     ------
     DesignError
-        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. If
-        ``designs`` or ``diameter_mm`` is set both in the file and by a parameter. The message names the file, the key
-        and what was expected.
+        If the file cannot be read, has an unknown key or a wrong value, or describes an impossible board. If the
+        sidecar names a design that is not known, or ``diameter_mm`` is given beside it. If ``designs`` or
+        ``diameter_mm`` is set both in the file and by a parameter. The message names the file, the key and what was
+        expected.
 
     Examples
     --------
@@ -78,9 +83,49 @@ def load_board(path: str | Path, patches: Sequence[Patch] | None = None, diamete
     (120.0, 80.0)
     """
     path = Path(path)
+    if path.suffix.lower() == ".json":
+        if diameter_mm is not None:
+            raise DesignError(f"{path}: the sidecar sets all diameters; drop `diameter_mm`")
+        return read_board_sidecar(path, patches)
     content = read_toml(path, DesignError)
     with name_source(path, DesignError):
         return parse_board(content, path, patches, diameter_mm)
+
+
+def load_boards(
+    name: str | Path, patches: Sequence[Patch] | None = None, diameter_mm: float | None = None
+) -> tuple[Board, ...]:
+    """Return the boards of a name, or the board of a file.
+
+    Parameters
+    ----------
+    name : str or Path
+        "hexagon" for a hexagon board per design, "grid" for one grid of 4 rows and 3 columns, or a file as for
+        :func:`kpbench.load_board`.
+    patches : sequence of Patch, optional
+        Designs on the boards. Default: the shipped designs, or as in the file.
+    diameter_mm : float, optional
+        Diameter of the discs. Default: 30, or as in the file.
+
+    Raises
+    ------
+    DesignError
+        If there is no such file, or as raised by :func:`kpbench.load_board`.
+
+    Examples
+    --------
+    >>> from kpbench.patches import load_boards
+    >>> [board.name for board in load_boards("hexagon")]
+    ['hexagon-checker', 'hexagon-trefoil', 'hexagon-wheel', 'hexagon-mushroom']
+    """
+    designs, diameter = patches or shipped_patches(), diameter_mm or DEFAULT_DIAMETER_MM
+    if name == "hexagon":
+        return tuple(hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in designs)
+    if name == "grid":
+        return (grid_board(designs, 4, 3, diameter, GRID_PITCH * diameter),)
+    if not Path(name).is_file():
+        raise DesignError(f"{name}: no such file, expected hexagon, grid or a board's file")
+    return (load_board(name, patches, diameter_mm),)
 
 
 def parse_board(

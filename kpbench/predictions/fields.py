@@ -99,8 +99,7 @@ EXPECTED_IN_RECORD = {
 
 
 def parse_header(content: Any) -> dict[str, Any]:
-    """Check a decoded header, and return its ``detector``, ``dataset``, ``fingerprint``, ``truth_digest``
-    and ``boards``.
+    """Check a decoded header, and return its fields but for the schema.
 
     Raises
     ------

@@ -15,12 +15,14 @@ from typing import Any
 from kpbench.errors import DesignError
 from kpbench.geometry.outline import move, rectangle
 from kpbench.patches.board import Board
+from kpbench.patches.board_sidecar import BOARD_SCHEMA
 from kpbench.patches.design import Patch
+from kpbench.patches.symmetry import pose_problem
 from kpbench.printing.font import font_size
 from kpbench.printing.marks import TICK, TICK_GAP, crop_mark, disc_marks, frame, registration_cross
 from kpbench.printing.page import CUT, INK, MARKS, Page, Shape, Text, round_to_nm
 from kpbench.printing.page_format import PAGE_MARGIN, PageFormat
-from kpbench.printing.sidecar import BOARD_SCHEMA, SHEET_SCHEMA, sidecar_entry, sidecar_head
+from kpbench.printing.sidecar import SHEET_SCHEMA, sidecar_entry, sidecar_head
 from kpbench.printing.tiling import Tile, cut_into_tiles
 
 CELL_GAP = 2 * (TICK_GAP + TICK) + 2.0  # mm: gap between two patches to cut out
@@ -165,6 +167,7 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
     sidecar = sidecar_head(BOARD_SCHEMA, board.name, board.digest, page_format, board.patches) | {
         "frame": "mm; x right, y down, z away from the viewer; the origin is the board's centre",
         "side_mm": [round_to_nm(board.side_x_mm), round_to_nm(board.side_y_mm)],
+        "unique_pose": not pose_problem(board),
         "keypoints": keypoints,
         "tiles": [_tile_entry(t, n, page_format) for n, t in enumerate(tiles, 1)],
     }

@@ -16,13 +16,13 @@ from typing import Any
 from kpbench import __version__
 from kpbench.errors import DesignError, system_reason
 from kpbench.files import load_json, read_bytes
+from kpbench.patches.board_sidecar import BOARD_SCHEMA
 from kpbench.patches.design import Patch
 from kpbench.printing.page import round_to_nm
 from kpbench.printing.page_format import PageFormat
 from kpbench.toml import LARGEST, TomlTable, name_source
 from kpbench.writing import write_file
 
-BOARD_SCHEMA = "kpbench.board/1"
 SHEET_SCHEMA = "kpbench.sheet/1"
 LARGEST_ERROR = 0.1  # largest accepted deviation of a measured ruler, as a fraction of the ruler's nominal length
 

@@ -177,7 +177,7 @@ BAD_RECORDS = [
     (record(image_id=...), ": no image_id, expected a whole number"),
     (
         record(labels=[1, 2]),
-        "(image_id 12): unknown key 'labels', expected A_patch2image, blur_px, board, covariance, file, frame_index, ids",
+        "(image_id 12): unknown key 'labels', expected A_patch2image, blur_px, board, covariance, file, frame_index",
     ),
     ([1, 2], " is a list, expected an object"),
 ]
@@ -231,7 +231,7 @@ BAD_FILES = [
     ("p.json", b"{}", "schema is missing, expected 'kpbench.predictions/2'"),
     ("p.json", b'{"schema": "coco"}', "schema is 'coco', expected 'kpbench.predictions/2'"),
     ("p.json", json.dumps(HEADER).encode(), "predictions is missing or null, expected a list"),
-    ("p.json", json.dumps({**HEADER, "model": 1, "predictions": []}).encode(), "unknown key 'model', expected boards, dataset"),
+    ("p.json", json.dumps({**HEADER, "model": 1, "predictions": []}).encode(), "unknown key 'model', expected boards"),
     ("p.json", json.dumps({**HEADER, "dataset": 1, "predictions": []}).encode(), "dataset is a number, expected"),
     ("p.json", json.dumps({**HEADER, "detector": "x", "predictions": []}).encode(), "detector is a text, expected an"),
     ("p.jsonl", json.dumps(record()).encode(), "schema is missing"),
