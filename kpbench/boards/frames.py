@@ -7,12 +7,19 @@ derivative at X is ``(B - H(X) cᵀ) / w(X)``. A detection gives H(X) as ``xy``,
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
+from kpbench.patches.design import Patch
 from kpbench.types import Detections, Float
+
+POINT_SIGMA = 0.03
+"""Standard deviation of a point, in disc radii, for finding a board."""
+KNOWN, UNKNOWN_SCALE, UNKNOWN_SHAPE = 0.03, 0.25, 0.1
+"""Standard deviations of what a design tells about its frame and of what it does not, in parts of the frame."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +74,24 @@ def _undistort(camera: Camera, xy: Float) -> Float:
         return np.concatenate([_undistort(camera, point[None]) for point in xy])
 
 
-def fit_homography(points: Float, xy: Float, J: Float) -> Float:
-    """Fit a homography to points and to its derivatives at these points, by linear least squares.
+@lru_cache(maxsize=256)
+def frame_errors(patch: Patch) -> tuple[float, float]:
+    """Return the standard deviations of the scale and of the shape of a frame, as parts of the frame.
 
-    Each point gives the equations ``a + B X - x (1 + cᵀ X) = 0`` and ``B - x cᵀ - J (1 + cᵀ X) = 0``, in which a point
-    and a frame that are wrong by the same part of the disc's radius weigh the same. One point determines an affine map,
-    two points a homography.
+    Rings tell the scale. Straight lines through the centre do not: only the edge of the disc does, which has little
+    contrast. Two lines do not tell the shape either: to scale along both of them changes nothing.
+    """
+    radii, angles, black = patch.cells
+    edges = angles[black[0] != np.roll(black[0], 1)] % 180.0
+    if len(radii) > 2:
+        return KNOWN, KNOWN
+    return UNKNOWN_SCALE, KNOWN if len({round(edge, 3) % 180.0 for edge in edges.tolist()}) > 2 else UNKNOWN_SHAPE
+
+
+def fit_homography(points: Float, xy: Float, J: Float, scale: Float, shape: Float) -> Float:
+    """Fit a homography to points and to its derivatives at these points, by weighted linear least squares.
+
+    Each point gives the equations ``a + B X - x (1 + cᵀ X) = 0`` and ``B - x cᵀ - J (1 + cᵀ X) = 0``.
 
     Parameters
     ----------
@@ -82,6 +101,8 @@ def fit_homography(points: Float, xy: Float, J: Float) -> Float:
         Their images x.
     J : ndarray of shape (n, 2, 2)
         Derivatives of the image by X.
+    scale, shape : ndarray of shape (n,)
+        Standard deviations of each J: along itself and across, see :func:`frame_errors`.
 
     Returns
     -------
@@ -90,7 +111,8 @@ def fit_homography(points: Float, xy: Float, J: Float) -> Float:
     """
     n, middle, centre = len(points), points.mean(axis=0), xy.mean(axis=0)
     reach = max(float(np.sqrt(((points - middle) ** 2).sum(axis=1).mean())), 1e-9)
-    gauge = np.sqrt(np.abs(np.linalg.det(J)).mean()) * reach  # size of the board in the image
+    radius = np.sqrt(np.abs(J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]))  # of each patch in the image
+    gauge = radius.mean() * reach  # size of the board in the image
     X, x, J = (points - middle) / reach, (xy - centre) / gauge, J * (reach / gauge)
     M, y = np.zeros((n, 6, 8)), np.zeros((n, 6))  # unknown: a (2), B by rows (4), c (2)
     for k in range(2):
@@ -100,15 +122,19 @@ def fit_homography(points: Float, xy: Float, J: Float) -> Float:
         y[:, k] = x[:, k]
         for m in range(2):
             row = 2 + 2 * k + m
-            M[:, row, 2 + 2 * k + m] = 1.0
+            M[:, row, row] = 1.0
             M[:, row, 6:] = -J[:, k, m, None] * X
             M[:, row, 6 + m] -= x[:, k]
             y[:, row] = J[:, k, m]
-    weight = 1.0 / np.sqrt(np.abs(np.linalg.det(J)))  # the size of a patch in the image
-    weights = np.repeat(weight[:, None], 6, axis=1)
-    weights[:, :2] *= reach
-    M, y = weights[:, :, None] * M, weights * y
-    a0, a1, b00, b01, b10, b11, c0, c1 = np.linalg.lstsq(M.reshape(-1, 8), y.ravel(), rcond=None)[0]
+    along = J.reshape(n, 4, 1) / np.sqrt((J**2).sum(axis=(1, 2)))[:, None, None]
+    along = along @ along.transpose(0, 2, 1)
+    whiten = np.zeros((n, 6, 6))
+    whiten[:, [0, 1], [0, 1]] = reach / POINT_SIGMA
+    total = np.sqrt(shape**2 + 2 * scale**2)
+    whiten[:, 2:, 2:] = (np.eye(4) - along) / shape[:, None, None] + along / total[:, None, None]
+    whiten *= (radius.mean() / radius)[:, None, None]
+    solved = np.linalg.lstsq((whiten @ M).reshape(-1, 8), (whiten @ y[..., None]).ravel(), rcond=None)[0]
+    a0, a1, b00, b01, b10, b11, c0, c1 = solved
     H = np.array([[b00, b01, a0], [b10, b11, a1], [c0, c1, 1.0]])
     to_plane = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, reach]])
     to_image = np.array([[gauge, 0, centre[0]], [0, gauge, centre[1]], [0, 0, 1.0]])

@@ -3,8 +3,8 @@
 1. Each detection may be each point of its ID, in each rotation that leaves its design unchanged: a candidate. It gives
    the derivative J of the homography from the board to the image.
 2. Two candidates confirm each other if one homography explains both. Along a line, a homography moves points by
-   ``H(X₂) - H(X₁) = λ J₁ (X₂ - X₁)`` with ``λ = (det J₂ / det J₁)^(1/3)``, and ``J₁ - J₂ / λ`` is of rank 1, with
-   columns parallel to this line.
+   ``H(X₂) - H(X₁) = λ J₁ (X₂ - X₁)`` with ``λ = (det J₂ / det J₁)^(1/3)``. ``J₁ - J₂ / λ`` is of rank 1, with columns
+   parallel to this line.
 3. From a candidate with enough confirmations, a homography is fitted, and fitted again with all detections that it
    explains.
 4. Every set of points that explains as many of the same detections as the best one is an alternative.
@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.boards.frames import Frames, fit_homography, straighten
+from kpbench.boards.frames import POINT_SIGMA, Frames, fit_homography, frame_errors, straighten
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
@@ -25,17 +25,15 @@ from kpbench.types import Detections, Float, Int
 
 LEAST_MATCHED = 3
 """Smallest number of detections that make a board."""
-PAIR_SLOPE, PAIR_OFFSET, PAIR_FRAME = 0.15, 0.3, 0.2
-"""Two candidates confirm each other up to an error of ``PAIR_SLOPE`` times their distance plus ``PAIR_OFFSET`` radii,
-and up to a relative error ``PAIR_FRAME`` of their frames."""
+PAIR_ANGLE, PAIR_LENGTH, PAIR_OFFSET = 0.2, 0.3, 0.3
+"""Two candidates confirm each other up to these errors of directions, rad, and of the logarithm of lengths, plus the
+errors of their frames, plus ``PAIR_OFFSET`` radii of a disc over their distance."""
 MOST_OFF, MOST_OFF_BENT = 0.2, 0.35
 """Largest distance of a detection from its point on the board, in disc radii: with a camera, and without one."""
-MOST_TURNED = 0.35
-"""Largest difference of a frame from its prediction, as Frobenius norm relative to the disc."""
-MOST_OFF_FIRST = 0.8
-"""``MOST_OFF`` of the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
-SIGMA = 0.02
-"""Standard deviation of the errors of points and of entries of frames, in disc radii, for comparing alternatives."""
+MOST_OFF_FIRST = 0.9
+"""The same for the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
+MOST_BENT, MOST_SCALED = 0.15, 0.2
+"""Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
 EXCLUDED = 50.0
 """Difference of two sums of squared errors, in ``SIGMA``, from which the worse explanation is excluded."""
 MOST_PAIRS = 400_000
@@ -55,6 +53,8 @@ class BoardMatch:
         Index of the board's keypoint for each of these detections.
     detections : Detections
         These detections. Of the rotations that leave a design unchanged, ``A_patch2image`` has the one of the board.
+    agrees : ndarray of shape (n,), bool
+        Whether the frame of each detection agrees with the board, not only its place and identity.
     alternatives : tuple of BoardMatch
         Other matches that explain the image as well. Their own ``alternatives`` are empty.
 
@@ -75,6 +75,7 @@ class BoardMatch:
     index: Int
     points: Int
     detections: Detections
+    agrees: NDArray[np.bool_]
     alternatives: tuple[BoardMatch, ...] = ()
 
     @property
@@ -87,7 +88,8 @@ class BoardMatch:
 class PointCandidates:
     """S candidates: a detection, a point of the board, and the derivative J of the homography that they give.
 
-    The board's unit is the mean radius of its discs. ``turn`` (S, 2, 2) rotates the frame of the detection.
+    The board's unit is the mean radius of its discs. ``turn`` (S, 2, 2) rotates the frame of the detection. ``scale``
+    and ``shape`` are the standard deviations of J, see :func:`kpbench.boards.frames.frame_errors`.
     """
 
     detection: Int
@@ -96,19 +98,29 @@ class PointCandidates:
     xy: Float
     X: Float
     J: Float
+    scale: Float
+    shape: Float
 
     def __getitem__(self, rows: Int) -> PointCandidates:
-        return PointCandidates(
-            self.detection[rows], self.point[rows], self.turn[rows], self.xy[rows], self.X[rows], self.J[rows]
-        )
+        of_board = self.X[rows], self.J[rows], self.scale[rows], self.shape[rows]
+        return PointCandidates(self.detection[rows], self.point[rows], self.turn[rows], self.xy[rows], *of_board)
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """PointCandidates that one homography explains, by detection, and the sum of their squared errors."""
+    """Candidates that one homography explains, by detection, and the sum of their squared errors.
+
+    ``agrees`` (n,) tells whether the frame agrees with the homography, too.
+    """
 
     candidates: PointCandidates
+    agrees: NDArray[np.bool_]
     cost: float
+
+    @property
+    def count(self) -> int:
+        """Number of frames that agree."""
+        return int(self.agrees.sum())
 
     @property
     def detection(self) -> Int:
@@ -185,9 +197,11 @@ def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> PointCandid
     unit_mm = float(diameter_mm.mean()) / 2
     usable = np.isfinite(frames.xy[:, 0]) & (_det(frames.A) > 0)
     detection, row = np.nonzero((patch_id[:, None] == ids[points]) & usable[:, None])
-    J = unit_mm * frames.A[detection] @ turns[row] @ to_patch[row]
     X = board.points_mm[points[row], :2] / unit_mm
-    return PointCandidates(detection, points[row], turns[row], frames.xy[detection], X, J)
+    J = unit_mm * frames.A[detection] @ turns[row] @ to_patch[row]
+    scale, shape = np.array([frame_errors(k.patch) for k in board.keypoints]).T
+    of_board = X, J, scale[points[row]], shape[points[row]]
+    return PointCandidates(detection, points[row], turns[row], frames.xy[detection], *of_board)
 
 
 def _det(matrices: Float) -> Float:
@@ -196,23 +210,32 @@ def _det(matrices: Float) -> Float:
 
 
 def _confirm(seed: PointCandidates, other: PointCandidates) -> tuple[NDArray[np.bool_], Float]:
-    """Return which candidates confirm each other, (S, T), and the relative errors of their distances, (S, T)."""
+    """Return which candidates confirm each other, (S, T), and how badly they do, (S, T)."""
     det_seed, det_other = _det(seed.J)[:, None], _det(other.J)
-    ratio = np.cbrt(det_other) / np.cbrt(det_seed)
     (X, Y), (x, y) = (other.X.T[:, None] - seed.X.T[:, :, None]), (other.xy.T[:, None] - seed.xy.T[:, :, None])
-    (a, b), (c, d) = seed.J.transpose(1, 2, 0)[..., None]
-    error = np.hypot(ratio * (a * X + b * Y) - x, ratio * (c * X + d * Y) - y)
-    (a, b), (c, d) = other.J.transpose(1, 2, 0)
-    error += np.hypot((a * X + b * Y) / ratio - x, (c * X + d * Y) / ratio - y)
-    length = np.hypot(x, y)
-    near = error <= 2 * PAIR_SLOPE * length + PAIR_OFFSET * (np.sqrt(det_seed) + np.sqrt(det_other))
-    near &= (seed.detection[:, None] != other.detection) & (seed.point[:, None] != other.point) & (length > 0)
+    ratio = np.cbrt(det_other) / np.cbrt(det_seed)
+    length = np.maximum(np.hypot(x, y), 1e-12)
+    offset = PAIR_OFFSET * (np.sqrt(det_seed) + np.sqrt(det_other)) / (2 * length)
+    error = np.zeros_like(length)
+    near = (seed.detection[:, None] != other.detection) & (seed.point[:, None] != other.point)
+    sigma = seed.scale[:, None] + other.scale
+    for J, factor, shape in ((seed.J[:, None], ratio, seed.shape[:, None]), (other.J, 1 / ratio, other.shape)):
+        u, v = J[..., 0, 0] * X + J[..., 0, 1] * Y, J[..., 1, 0] * X + J[..., 1, 1] * Y
+        predicted = np.maximum(np.hypot(u, v), 1e-12)
+        sine = np.abs(u * y - v * x) / (predicted * length)
+        near &= (u * x + v * y > 0) & (sine <= PAIR_ANGLE + 2 * shape + offset)
+        stretch = np.abs(np.log(length / (factor * predicted)))
+        near &= stretch <= PAIR_LENGTH + 2 * sigma + offset
+        error += sine + stretch / (1 + 8 * sigma)
     s, t = np.nonzero(near)
-    difference = seed.J[s] - other.J[t] / ratio[s, t, None, None]
-    across = (x[s, t, None] * difference[:, 1] - y[s, t, None] * difference[:, 0]) / length[s, t, None]
-    size = np.sqrt((seed.J[s] ** 2).sum(axis=(1, 2)))
-    near[s, t] = np.hypot(across[:, 0], across[:, 1]) <= PAIR_FRAME * size
-    return near, error / np.maximum(length, 1e-300)
+    across = np.stack([-y[s, t], x[s, t]], axis=-1)[
+        :, None
+    ]  # the derivatives across the line are parallel on the board
+    first, second = (across @ seed.J[s])[:, 0], (across @ other.J[t])[:, 0]
+    sine = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
+    size = np.hypot(first[:, 0], first[:, 1]) * np.hypot(second[:, 0], second[:, 1])
+    near[s, t] = (sine <= (PAIR_ANGLE + 2 * (seed.shape[s] + other.shape[t])) * size) & ((first * second).sum(1) > 0)
+    return near, error
 
 
 def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Explanation]:
@@ -233,10 +256,9 @@ def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Expl
         fitted = _fit(candidates, np.append(rows[near], seed), limit)
         if fitted is None:
             continue
-        rows, cost = fitted
-        used.update(rows.tolist())
-        explanation = Explanation(candidates[rows[np.argsort(candidates.detection[rows])]], cost)
-        best[explanation.detection] = np.maximum(best[explanation.detection], len(rows))
+        rows, explanation = fitted
+        used.update(rows[explanation.agrees].tolist())
+        best[explanation.detection] = np.maximum(best[explanation.detection], explanation.count)
         found.append(explanation)
     return found
 
@@ -253,25 +275,31 @@ def _unique(candidates: PointCandidates, rows: Int, error: Float) -> Int:
     return np.array(kept, np.int64)
 
 
-def _fit(candidates: PointCandidates, rows: Int, limit: float) -> tuple[Int, float] | None:
-    """Fit a homography to candidates, then to all that it explains, until they stay. Return them and their cost."""
+def _fit(candidates: PointCandidates, rows: Int, limit: float) -> tuple[Int, Explanation] | None:
+    """Fit a homography to candidates, then to all that it explains, until they stay. Return what it explains."""
     for largest in (MOST_OFF_FIRST, limit, limit, limit):
-        H = fit_homography(candidates.X[rows], candidates.xy[rows], candidates.J[rows])
-        point_error, frame_error = _errors(H, candidates)
-        near = np.flatnonzero((point_error <= largest) & (frame_error <= MOST_TURNED))
-        before, rows = rows, _unique(candidates, near, point_error)
+        part = candidates[rows]
+        H = fit_homography(part.X, part.xy, part.J, part.scale, part.shape)
+        off, bent, scaled = _errors(H, candidates)
+        agrees = (bent <= MOST_BENT + 3 * candidates.shape) & (scaled <= MOST_SCALED + 3 * candidates.scale)
+        before, rows = rows, _unique(candidates, np.flatnonzero((off <= largest) & agrees), off)
         if len(rows) < LEAST_MATCHED:
             return None
         if largest == limit and {*before.tolist()} == {*rows.tolist()}:
             break
-    cost = (point_error[rows] ** 2 + frame_error[rows] ** 2).sum() / SIGMA**2
-    return rows, float(cost)
+    squares = (off / POINT_SIGMA) ** 2 + (bent / candidates.shape) ** 2 + (scaled / candidates.scale) ** 2
+    cost = float(squares[rows].sum())
+    rest = np.flatnonzero((off <= limit) & ~np.isin(candidates.point, candidates.point[rows]))
+    rest = rest[~np.isin(candidates.detection[rest], candidates.detection[rows])]
+    rows = np.append(rows, _unique(candidates, rest, off + 1e-6 * bent))
+    rows = rows[np.argsort(candidates.detection[rows])]
+    return rows, Explanation(candidates[rows], agrees[rows], cost)
 
 
-def _errors(H: Float, candidates: PointCandidates) -> tuple[Float, Float]:
-    """Return the errors of points and frames, in disc radii, of all candidates under a homography.
+def _errors(H: Float, candidates: PointCandidates) -> tuple[Float, Float, Float]:
+    """Return the errors of all candidates under a homography: of the points, and of the frames' shape and log scale.
 
-    Both are measured on the board; inf for a candidate that the homography cannot show.
+    Points and shapes are measured on the board, in disc radii; inf for a candidate that the homography cannot show.
     """
     X, J = candidates.X, candidates.J
     w = X @ H[2, :2] + H[2, 2]
@@ -280,31 +308,35 @@ def _errors(H: Float, candidates: PointCandidates) -> tuple[Float, Float]:
         expected = (H[:2, :2] - seen[:, :, None] * H[2, :2]) / w[:, None, None]
         (a, b), (c, d) = expected.transpose(1, 2, 0)
         back = np.array([[d, -b], [-c, a]]).transpose(2, 0, 1) / (a * d - b * c)[:, None, None]
-        frame = np.sqrt(((back @ J - np.eye(2)) ** 2).sum(axis=(1, 2)))
-        offset = np.einsum("nij,nj->ni", back, candidates.xy - seen)
-        point = np.hypot(offset[:, 0], offset[:, 1])
-        valid = (a * d - b * c > 0) & np.isfinite(frame) & np.isfinite(point)
-    return np.where(valid, point, np.inf), np.where(valid, frame, np.inf)
+        frame = back @ J
+        scale = np.sqrt(_det(frame))
+        bent = np.sqrt(((frame / scale[:, None, None] - np.eye(2)) ** 2).sum(axis=(1, 2)))
+        offset = (back @ (candidates.xy - seen)[..., None])[..., 0]
+        off = np.hypot(offset[:, 0], offset[:, 1])
+        valid = (a * d - b * c > 0) & np.isfinite(bent) & np.isfinite(off)
+        errors = off, bent, np.abs(np.log(scale))
+    off, bent, scaled = (np.where(valid, error, np.inf) for error in errors)
+    return off, bent, scaled
 
 
 def _choose(explanations: list[Explanation], detections: Detections, board: Board) -> tuple[BoardMatch, ...]:
     """Return the best explanations that share no detection, each with its alternatives."""
     chosen = list[list[Explanation]]()
-    for e in sorted(explanations, key=lambda e: (-len(e.detection), e.cost)):
+    for e in sorted(explanations, key=lambda e: (-e.count, e.cost)):
         rivals = [group for group in chosen if np.isin(e.detection, group[0].detection).any()]
         if not rivals:
             chosen.append([e])
         for group in rivals:
             best = group[0]
-            limit = best.cost + EXCLUDED * max(1.0, best.cost / (6 * len(best.detection) - 8))
-            if len(e.detection) == len(best.detection) and e.cost <= limit and not any(_are_equal(e, o) for o in group):
+            limit = best.cost + EXCLUDED * max(1.0, best.cost / (6 * best.count - 8))
+            if e.count == best.count and e.cost <= limit and not any(_are_equal(e, o) for o in group):
                 group.append(e)
 
     def make(e: Explanation, *others: Explanation) -> BoardMatch:
         c, found = e.candidates, detections[e.detection]
         assert found.A_patch2image is not None
         found = replace(found, A_patch2image=found.A_patch2image @ c.turn)
-        return BoardMatch(board, c.detection, c.point, found, tuple(map(make, others)))
+        return BoardMatch(board, c.detection, c.point, found, e.agrees, tuple(map(make, others)))
 
     return tuple(make(*group) for group in chosen)
 

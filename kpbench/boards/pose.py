@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kpbench.boards.frames import Frames, fit_homography, straighten
+from kpbench.boards.frames import Frames, fit_homography, frame_errors, straighten
 from kpbench.boards.matching import BoardMatch
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
@@ -22,6 +22,8 @@ EXCLUDED_POSE = 25.0
 """Difference of two sums of squared errors, in standard deviations, from which the worse pose is excluded."""
 SAME_POSE = 0.1
 """Two poses are one if the squared distance between them, in standard deviations, is smaller."""
+WRONG_FRAME = 100.0
+"""Standard deviation of a frame that does not agree with the board, in parts of the frame."""
 FLOOR_PX = 0.01
 """Added to the standard deviations of points."""
 LEAST_GAIN = 1e-4
@@ -146,7 +148,11 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
         raise DataError(f"{name}: the camera's lens shows no such points")
     points, _, to_patch = match.board.orientations
     J = frames.A @ to_patch[np.searchsorted(points, match.points)]
-    R, t = _initial_poses(X, frames.xy, J, float(np.mean([k.diameter_mm for k in match.board.keypoints])) / 2)
+    scale, shape = np.array([frame_errors(match.board.keypoints[n].patch) for n in match.points]).T
+    shape = np.where(match.agrees, shape, WRONG_FRAME)
+    unit_mm = float(np.mean([k.diameter_mm for k in match.board.keypoints])) / 2
+    H = fit_homography(X[:, :2] / unit_mm, frames.xy, J * unit_mm, scale, shape) @ np.diag([1, 1, unit_mm])
+    R, t = _initial_poses(H, np.append(X[:, :2].mean(axis=0), 1.0))
     R, t, information, cost = _refine(R, t, X, frames.xy, _whitening(frames, camera))
     valid = np.isfinite(cost) & ((X @ R[:, 2, :, None])[..., 0] + t[:, 2:] > 0).all(axis=1)
     if not valid.any():
@@ -164,14 +170,12 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     return poses
 
 
-def _initial_poses(X: Float, xy: Float, J: Float, unit_mm: float) -> tuple[Float, Float]:
-    """Return the two poses of the plane whose image is that of a homography to first order at the middle of the points.
+def _initial_poses(H: Float, middle: Float) -> tuple[Float, Float]:
+    """Return the two poses of the plane whose image is that of H to first order at the point (x, y, 1).
 
     With ``v`` the ray of the middle and z its depth, ``J = B R₂₂ / z``, where R₂₂ is a part of the rotation in a frame
     whose axis is v, and ``B = [I, -v] Rv``. The greatest singular value of ``B⁻¹ J`` is 1 / z (Collins and Bartoli).
     """
-    H = fit_homography(X[:, :2] / unit_mm, xy, J * unit_mm) @ np.diag([1, 1, unit_mm])
-    middle = np.append(X[:, :2].mean(axis=0), 1.0)
     a, b, w = H @ middle
     v = np.array([a, b]) / w
     J_middle = (H[:2, :2] - np.outer(v, H[2, :2])) / w
