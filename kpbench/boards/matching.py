@@ -21,7 +21,7 @@ from kpbench.boards.frames import POINT_SIGMA, Frames, fit_homography, frame_err
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
-from kpbench.types import Detections, Float, Int
+from kpbench.types import Detections, Float, Float32, Int
 
 LEAST_MATCHED = 3
 """Smallest number of detections that make a board."""
@@ -34,6 +34,8 @@ MOST_OFF_FIRST = 0.9
 """The same for the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
 MOST_BENT, MOST_SCALED = 0.15, 0.2
 """Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
+WORTH_FITTING = 0.8
+"""A candidate is fitted if its confirmations are at least this part of those of the best fit with its detection."""
 EXCLUDED = 50.0
 """Difference of two sums of squared errors, in ``SIGMA``, from which the worse explanation is excluded."""
 MOST_PAIRS = 400_000
@@ -241,15 +243,16 @@ def _confirm(seed: PointCandidates, other: PointCandidates) -> tuple[NDArray[np.
 def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Explanation]:
     """Return explanations that begin with some of the candidates, each once."""
     confirmed, error = _confirm(candidates[seeds], candidates)
-    of_detection = candidates.detection == np.arange(candidates.detection.max(initial=0) + 1)[:, None]
-    support = ((confirmed.astype(np.float32) @ of_detection.T.astype(np.float32)) > 0).sum(axis=1)
-    found, used, best = list[Explanation](), set[int](), np.zeros(len(of_detection))
+    of_detection, of_point = _one_hot(candidates.detection), _one_hot(candidates.point)
+    counts = [((confirmed.astype(np.float32) @ hot) > 0).sum(axis=1) for hot in (of_detection, of_point)]
+    support = np.minimum(*counts)
+    found, used, best = list[Explanation](), set[int](), np.zeros(of_detection.shape[1])
     for s in np.argsort(-support, kind="stable").tolist():
         seed = int(seeds[s])
         size = support[s] + 1
         if size < LEAST_MATCHED:
             break
-        if seed in used or size < 0.6 * best[candidates.detection[seed]]:
+        if seed in used or size < WORTH_FITTING * best[candidates.detection[seed]]:
             continue
         rows = _unique(candidates, np.flatnonzero(confirmed[s]), error[s])
         near = np.argsort(((candidates.X[rows] - candidates.X[seed]) ** 2).sum(axis=1), kind="stable")[:3]
@@ -261,6 +264,11 @@ def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Expl
         best[explanation.detection] = np.maximum(best[explanation.detection], explanation.count)
         found.append(explanation)
     return found
+
+
+def _one_hot(index: Int) -> Float32:
+    """Return a matrix (S, n) with a one in the column that each of S indices names."""
+    return (index[:, None] == np.arange(index.max(initial=0) + 1)).astype(np.float32)
 
 
 def _unique(candidates: PointCandidates, rows: Int, error: Float) -> Int:
