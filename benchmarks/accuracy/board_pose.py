@@ -159,9 +159,14 @@ def main() -> None:
         for size in PARTS:
             if len(right) > size:
                 keep = (true < 0) | np.isin(true, rng.choice(right, size, replace=False))
-                judge(tables["part"][f"{board.name}, part of {size}"], detections[keep], true[keep], board, camera, truth)
+                judge(
+                    tables["part"][f"{board.name}, part of {size}"], detections[keep], true[keep], board, camera, truth
+                )
     for name, table in tables.items():
-        print(f"\n{name}\n\n| | images | found | ambiguous | wrong points unflagged | poses | unflagged | wrong of them", end="")
+        print(
+            f"\n{name}\n\n| | images | found | ambiguous | wrong points unflagged | poses | unflagged | wrong of them",
+            end="",
+        )
         print(" | mm: median / 95 % | degrees | NEES: mean (median) | ms |\n|" + "---|" * 12)
         for key in sorted(table) if name != "rungs" else table:
             print(row(key, table[key]))

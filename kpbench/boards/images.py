@@ -152,7 +152,7 @@ def locate_boards(
         zip(predictions.detections(), pairwise(predictions.offsets.tolist()), strict=True)
     ):
         of_image = _camera_of(predictions, n, camera)
-        found = find_boards(detections, boards, of_image) if len(detections) else tuple(() for _ in boards)
+        found = find_boards(detections, boards, of_image)
         for k, matches in enumerate(found):
             for match in matches:
                 board_of[first + match.index] = k

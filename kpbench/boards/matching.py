@@ -171,6 +171,8 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
     >>> match.points.tolist(), match.ambiguous
     ([3, 2, 1, 0], False)
     """
+    if not len(detections):
+        return ()
     if detections.patch_id is None:
         raise DataError("the detector gives no patch IDs, which a board needs")
     frames = straighten(detections, camera)
@@ -230,9 +232,7 @@ def _confirm(seed: PointCandidates, other: PointCandidates) -> tuple[NDArray[np.
         near &= stretch <= PAIR_LENGTH + 2 * sigma + offset
         error += sine + stretch / (1 + 8 * sigma)
     s, t = np.nonzero(near)
-    across = np.stack([-y[s, t], x[s, t]], axis=-1)[
-        :, None
-    ]  # the derivatives across the line are parallel on the board
+    across = np.stack([-y[s, t], x[s, t]], axis=-1)[:, None]  # the derivatives across are parallel on the board
     first, second = (across @ seed.J[s])[:, 0], (across @ other.J[t])[:, 0]
     sine = np.abs(first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0])
     size = np.hypot(first[:, 0], first[:, 1]) * np.hypot(second[:, 0], second[:, 1])
