@@ -155,7 +155,8 @@ def main() -> None:
         count = f"{board.name}, {len(right)} right points"
         judge(tables["points"][count], detections, true, board, camera, truth)
         if len(right) >= 5:
-            judge(tables["rungs"][f"{view.condition} {view.rung:g}"], detections, true, board, camera, truth)
+            for key in (f"{view.condition} {view.rung:g}", "all"):
+                judge(tables["rungs"][key], detections, true, board, camera, truth)
         for size in PARTS:
             if len(right) > size:
                 keep = (true < 0) | np.isin(true, rng.choice(right, size, replace=False))

@@ -24,7 +24,7 @@ SAME_POSE = 0.1
 """Two poses are one if the squared distance between them, in standard deviations, is smaller."""
 WRONG_FRAME = 100.0
 """Standard deviation of a frame that does not agree with the board, in parts of the frame."""
-FLOOR_PX = 0.01
+FLOOR_PX = 0.001
 """Added to the standard deviations of points."""
 LEAST_GAIN = 1e-4
 """The refinement ends when the sums of squared errors fall by no more than this part."""

@@ -62,7 +62,7 @@ def test_csv_and_json_lines_hold_the_same_poses(tmp_path):
             assert line["rotation"] is None
             assert row["tx_mm"] == row["covariance_11"] == ""
             continue
-        R, t = truths[record.image_id].poses[0]
+        R, _ = truths[record.image_id].poses[0]
         np.testing.assert_allclose(line["rotation"], R, atol=0.05)
         assert [float(row[f"t{axis}_mm"]) for axis in "xyz"] == line["translation_mm"]
         assert [float(row[f"q{axis}"]) for axis in "xyzw"] == line["quaternion_xyzw"]

@@ -16,6 +16,8 @@ from kpbench.dataset.generation import generate
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.detectors.prediction import predict_images
 from kpbench.errors import DataError
+from kpbench.geometry.camera import Camera
+from kpbench.geometry.camera_file import write_camera
 from kpbench.images import ImageSource, image_writer
 from kpbench.patches.design import load_patches
 from kpbench.predictions.files import read_predictions
@@ -439,3 +441,70 @@ def test_images_of_several_sizes_make_no_video(folder, plug):
     result = kpbench("detect", "photos", "--detector", f"{plug}:brightest", "--overlay", "out.mp4", code=1)
     assert result.stderr.startswith("kpbench: out.mp4: z.png differs in size from the images before, expected a folder")
     assert not (folder / "out.mp4").exists()
+
+
+BOARD_MODULE = """
+import numpy as np
+from kpbench import Detections
+
+def four(image):  # four patches in a square, seen from the front at 2 px per mm
+    xy = np.array([[280.0, 200], [360, 200], [280, 280], [360, 280]])
+    return Detections(xy, np.ones(4), [0, 1, 1, 2], np.tile(20 * np.eye(2), (4, 1, 1)))
+"""
+BOARD = "grid = { rows = 2, columns = 2, pitch_mm = 40 }\ndiameter_mm = 20\n"
+
+
+@pytest.fixture
+def film(here, monkeypatch):
+    """Images, a detector that sees a board in each of them, the board and the camera."""
+    monkeypatch.syspath_prepend(str(here))
+    (here / f"plug_{abs(hash(str(here)))}.py").write_text(BOARD_MODULE)
+    (here / "square.toml").write_text(BOARD)
+    write_camera("camera.yaml", Camera(640, 480, 700.0, principal_px=(320.0, 240.0)))
+    (here / "photos").mkdir()
+    for n in range(3):
+        cv2.imwrite(f"photos/{n}.png", np.full((480, 640), n, np.uint8))
+    return next(here.glob("plug_*.py")).stem + ":four"
+
+
+def test_boards_and_poses_without_a_line_of_python(film):
+    boards = ("--board", "square.toml", "--board", "hexagon", "--camera", "camera.yaml")
+    done = kpbench("detect", "photos", "--detector", film, *boards, "--poses", "poses.jsonl", "--out", "p.csv")
+    assert "poses.jsonl: 3 of 3 images have a pose; 0 poses are ambiguous" in done.stderr
+    poses = [json.loads(line) for line in Path("poses.jsonl").read_text().splitlines()[1:]]
+    assert [(p["file"], p["board"], p["reason"]) for p in poses[:2]] == [
+        ("photos/0.png", "square", None),
+        ("photos/0.png", "hexagon-checker", "the board was not found"),
+    ]
+    np.testing.assert_allclose(poses[0]["translation_mm"], [0, 0, 350], atol=1e-6)
+    predictions = read_predictions("p.csv")
+    assert predictions.boards[:2] == ("square", "hexagon-checker")
+    assert predictions.points.tolist() == [0, 1, 2, 3] * 3
+    assert predictions.board.tolist() == [0] * 12
+
+
+def test_boards_go_into_the_stream(film):
+    done = kpbench("detect", "photos", "--detector", film, "--board", "square.toml", "--out", "-")
+    header, *lines = map(json.loads, done.stdout.splitlines())
+    assert header["boards"] == ["square"]
+    assert [line["points"] for line in lines] == [[0, 1, 2, 3]] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "message"),
+    [
+        (("--board", "none.toml"), 1, "none.toml: no such file, expected hexagon, grid or a board's file"),
+        (("--board", "camera.yaml"), 1, "camera.yaml: not valid TOML"),
+        (("--board", "square.toml", "--camera", "square.toml"), 1, "square.toml: no calibration file"),
+        (("--board", "square.toml", "--camera", "small.yaml"), 1, "photos/0.png: the image has 640x480 px, expected"),
+        (("--board", "square.toml", "--camera", "camera.yaml", "--poses", "p.txt"), 1, "p.txt: unknown kind of poses"),
+        (("--board", "square.toml", "--poses", "p.csv"), 2, "--poses needs --board and --camera"),
+        (("--camera", "camera.yaml"), 2, "--camera needs --board"),
+    ],
+)
+def test_what_is_wrong_with_boards_and_cameras_is_one_line(film, options, code, message):
+    write_camera("small.yaml", Camera(400, 300, 700.0))
+    done = kpbench("detect", "photos", "--detector", film, *options, code=code)
+    assert message in done.stderr
+    assert code == 2 or len(done.stderr.splitlines()) == 1
+    assert not Path("preds.json").exists()

@@ -146,3 +146,13 @@ def test_pdfinfo_sees_an_a4_page():
     told = subprocess.run(["pdfinfo", "-box", pdf], capture_output=True, text=True, check=True).stdout
     width, height = map(float, re.search(r"Page size: +([\d.]+) x ([\d.]+) pts \(A4\)", told).groups())
     assert (width * 25.4 / 72, height * 25.4 / 72) == pytest.approx((210, 297), abs=0.01)
+
+
+def test_a_board_without_a_unique_pose_is_warned_of_and_says_so():
+    result = kpbench("render-patches", "--board", "hexagon", "--svg")
+    assert "the pose of board hexagon-checker is not unique: it looks the same after a turn of 180" in result.stderr
+    assert result.stderr.count("not unique") == 1
+    sidecars = sorted(Path("patches-print").glob("*.json"))
+    unique = {path.stem: load(path)["unique_pose"] for path in sidecars}
+    assert unique.pop("hexagon-checker") is False
+    assert {*unique.values()} == {True}
