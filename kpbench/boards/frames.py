@@ -14,10 +14,12 @@ import numpy as np
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.design import Patch
-from kpbench.types import Detections, Float
+from kpbench.types import Detections, Float, Int
 
 POINT_SIGMA = 0.03
 """Standard deviation of a point, in disc radii, for finding a board."""
+RIDGE = 1e-12
+"""Part of their diagonal that is added to normal equations, so that they can always be solved."""
 KNOWN, UNKNOWN_SCALE, UNKNOWN_SHAPE = 0.03, 0.25, 0.1
 """Standard deviations of what a design tells about its frame and of what it does not, in parts of the frame."""
 
@@ -39,6 +41,9 @@ class Frames:
     xy: Float
     A: Float
     covariance: Float | None
+
+    def __getitem__(self, rows: Int) -> Frames:
+        return Frames(self.xy[rows], self.A[rows], None if self.covariance is None else self.covariance[rows])
 
 
 def straighten(detections: Detections, camera: Camera | None) -> Frames:
@@ -133,8 +138,10 @@ def fit_homography(points: Float, xy: Float, J: Float, scale: Float, shape: Floa
     total = np.sqrt(shape**2 + 2 * scale**2)
     whiten[:, 2:, 2:] = (np.eye(4) - along) / shape[:, None, None] + along / total[:, None, None]
     whiten *= (radius.mean() / radius)[:, None, None]
-    solved = np.linalg.lstsq((whiten @ M).reshape(-1, 8), (whiten @ y[..., None]).ravel(), rcond=None)[0]
-    a0, a1, b00, b01, b10, b11, c0, c1 = solved
+    rows, right = (whiten @ M).reshape(-1, 8), (whiten @ y[..., None]).ravel()
+    normal = rows.T @ rows
+    normal.flat[::9] *= 1 + RIDGE
+    a0, a1, b00, b01, b10, b11, c0, c1 = np.linalg.solve(normal, rows.T @ right)
     H = np.array([[b00, b01, a0], [b10, b11, a1], [c0, c1, 1.0]])
     to_plane = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, reach]])
     to_image = np.array([[gauge, 0, centre[0]], [0, gauge, centre[1]], [0, 0, 1.0]])

@@ -34,7 +34,7 @@ MOST_OFF_FIRST = 0.9
 """The same for the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
 MOST_BENT, MOST_SCALED = 0.15, 0.2
 """Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
-WORTH_FITTING = 0.8
+WORTH_FITTING = 0.9
 """A candidate is fitted if its confirmations are at least this part of those of the best fit with its detection."""
 EXCLUDED = 50.0
 """Difference of two sums of squared errors, in ``SIGMA``, from which the worse explanation is excluded."""
@@ -59,6 +59,10 @@ class BoardMatch:
         Whether the frame of each detection agrees with the board, not only its place and identity.
     alternatives : tuple of BoardMatch
         Other matches that explain the image as well. Their own ``alternatives`` are empty.
+    camera : Camera or None
+        Camera with which the board was found.
+    frames : Frames or None
+        ``detections`` without the distortion of ``camera``; computed anew if None.
 
     Examples
     --------
@@ -79,6 +83,8 @@ class BoardMatch:
     detections: Detections
     agrees: NDArray[np.bool_]
     alternatives: tuple[BoardMatch, ...] = ()
+    camera: Camera | None = None
+    frames: Frames | None = None
 
     @property
     def ambiguous(self) -> bool:
@@ -188,7 +194,7 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
         explained = np.concatenate([left[:0], *(e.detection for e in explanations)])
         left = left[count:]
         left = left[~np.isin(left, explained)]
-    return _choose(explanations, detections, board)
+    return _choose(explanations, detections, board, frames, camera)
 
 
 def _make_candidates(frames: Frames, patch_id: Int, board: Board) -> PointCandidates:
@@ -268,7 +274,7 @@ def _explain(candidates: PointCandidates, seeds: Int, limit: float) -> list[Expl
 
 def _one_hot(index: Int) -> Float32:
     """Return a matrix (S, n) with a one in the column that each of S indices names."""
-    return (index[:, None] == np.arange(index.max(initial=0) + 1)).astype(np.float32)
+    return np.asarray(index[:, None] == np.arange(index.max(initial=0) + 1), np.float32)
 
 
 def _unique(candidates: PointCandidates, rows: Int, error: Float) -> Int:
@@ -327,7 +333,9 @@ def _errors(H: Float, candidates: PointCandidates) -> tuple[Float, Float, Float]
     return off, bent, scaled
 
 
-def _choose(explanations: list[Explanation], detections: Detections, board: Board) -> tuple[BoardMatch, ...]:
+def _choose(
+    explanations: list[Explanation], detections: Detections, board: Board, frames: Frames, camera: Camera | None
+) -> tuple[BoardMatch, ...]:
     """Return the best explanations that share no detection, each with its alternatives."""
     chosen = list[list[Explanation]]()
     for e in sorted(explanations, key=lambda e: (-e.count, e.cost)):
@@ -344,7 +352,9 @@ def _choose(explanations: list[Explanation], detections: Detections, board: Boar
         c, found = e.candidates, detections[e.detection]
         assert found.A_patch2image is not None
         found = replace(found, A_patch2image=found.A_patch2image @ c.turn)
-        return BoardMatch(board, c.detection, c.point, found, e.agrees, tuple(map(make, others)))
+        straight = frames[e.detection]
+        straight = replace(straight, A=straight.A @ c.turn)
+        return BoardMatch(board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), camera, straight)
 
     return tuple(make(*group) for group in chosen)
 

@@ -143,7 +143,9 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     extent = np.linalg.svd(X - X.mean(axis=0), compute_uv=False)
     if extent[1] < LEAST_ASIDE * extent[0]:
         raise DataError(f"{name}: {len(X)} points on one line, expected some beside it for a pose")
-    frames = straighten(match.detections, camera)
+    frames = match.frames if match.camera == camera else None
+    if frames is None:
+        frames = straighten(match.detections, camera)
     if not np.isfinite(frames.xy).all():
         raise DataError(f"{name}: the camera's lens shows no such points")
     points, _, to_patch = match.board.orientations
@@ -183,14 +185,16 @@ def _initial_poses(H: Float, middle: Float) -> tuple[Float, Float]:
     x, y, z = axis
     Rv = np.array([[1 - x * x / (1 + z), -x * y / (1 + z), x], [-x * y / (1 + z), 1 - y * y / (1 + z), y], [-x, -y, z]])
     A = np.linalg.solve(np.column_stack([np.eye(2), -v]) @ Rv[:, :2], J_middle)
-    inverse_z = np.linalg.norm(A, 2)
+    squares, det = float((A * A).sum()), float(A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0])
+    inverse_z = np.sqrt((squares + np.sqrt(max(squares**2 - 4 * det**2, 0.0))) / 2)
     R22 = A / inverse_z
     rest = np.eye(2) - R22.T @ R22
     low = np.sqrt(np.maximum(np.diag(rest), 0.0)) * [1.0, 1.0 if rest[0, 1] >= 0 else -1.0]
     R, t = np.empty((2, 3, 3)), np.empty((2, 3))
     for k, sign in enumerate((1.0, -1.0)):
-        columns = np.vstack([R22, sign * low])
-        R[k] = Rv @ np.column_stack([columns, np.cross(columns[:, 0], columns[:, 1])])
+        (a, b), (c, d) = R22
+        e, f = sign * low
+        R[k] = Rv @ np.array([[a, b, c * f - d * e], [c, d, b * e - a * f], [e, f, a * d - b * c]])
         t[k] = np.append(v, 1.0) / inverse_z - R[k][:, :2] @ middle[:2]
     return R, t
 
