@@ -10,10 +10,16 @@ SAME_MM, SAME_DEG = 1e-3, 1e-3
 """Points and rotations that differ by less are the same."""
 
 
-def board_turns_deg(board: Board) -> tuple[float, ...]:
+def board_turns_deg(board: Board, by_place: bool = False) -> tuple[float, ...]:
     """Return the rotations about the middle of its keypoints that leave a board unchanged, degrees in (0, 360).
 
     Places, designs, diameters and the rotations of the patches are compared, the edge of the board is not.
+
+    Parameters
+    ----------
+    board : Board
+    by_place : bool
+        Leave out the rotations of the patches.
 
     Examples
     --------
@@ -39,7 +45,7 @@ def board_turns_deg(board: Board) -> tuple[float, ...]:
         to = gap.argmin(axis=1)
         turned = (rotate_deg + turn_deg - rotate_deg[to]) * np.maximum(order, 1) / 360.0
         off_deg = np.where(order > 0, np.abs(turned - np.rint(turned)) * 360.0, 0.0)
-        same = (patch_id[to] == patch_id) & (np.abs(size[to] - size) < SAME_MM) & (off_deg < SAME_DEG)
+        same = (patch_id[to] == patch_id) & (np.abs(size[to] - size) < SAME_MM) & (by_place | (off_deg < SAME_DEG))
         return bool((same & (gap.min(axis=1) < SAME_MM)).all())
 
     turns = (angle[np.abs(distance - distance[first]) < SAME_MM] - angle[first]) % 360.0

@@ -1,6 +1,7 @@
 """Which detection is which point of a board: simulated views, and every possible pairing tried."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -155,10 +156,20 @@ def test_a_detection_with_a_wrong_frame_keeps_its_point():
     truth = scene(np.random.default_rng(8), BOARDS["wheel"], CAMERA, alarms=0)
     A = truth.found.A_patch2image.copy()
     A[2] = -A[2]
-    found = Detections(truth.found.xy, truth.found.score, truth.found.patch_id, A)
+    found = replace(truth.found, A_patch2image=A)
     [match] = find_board(found, BOARDS["wheel"], CAMERA)
     assert is_right(match, truth)
     assert match.agrees.tolist() == [True, True, False, True, True, True]
+
+
+def test_the_orientation_of_blurred_patches_that_are_not_sure_is_not_believed():
+    for name, seen, is_clear in (("wheel", 6, False), ("mixed", 6, True), ("mixed", 4, False), ("wheel", 3, False)):
+        truth = scene(np.random.default_rng(8), BOARDS[name], CAMERA, seen, alarms=0)
+        for score, blur_px, is_sharp in ((0.95, 90.0, True), (0.6, 0.1, True), (0.6, 90.0, False)):
+            n = len(truth.found)
+            blurred = replace(truth.found, score=np.full(n, score), blur_px=np.full(n, blur_px))
+            [match] = find_board(blurred, BOARDS[name], CAMERA)
+            assert match.ambiguous == (not is_sharp and not is_clear)
 
 
 def test_boards_that_explain_the_same_detections_are_ambiguous():
