@@ -87,5 +87,5 @@ def scene(rng, board, camera=CAMERA, seen=None, copies=1, alarms=4, poses=None):
     rows = [rows[n] for n in rng.permutation(len(rows))]
     xy, A, sigma, ids, copy, point = map(np.array, zip(*rows, strict=True))
     covariance = sigma[:, None, None] ** 2 * np.eye(2)
-    found = Detections(xy, rng.uniform(0.3, 1, len(xy)), ids, A, covariance, np.full(len(xy), 0.3))
+    found = Detections(xy, rng.uniform(0.3, 1, len(xy)), ids, A, covariance, sigma)
     return Scene(found, copy, point, poses)

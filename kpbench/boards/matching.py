@@ -41,6 +41,9 @@ SURE_SCORE, SHARP_BLUR = 0.9, 0.15
 """The orientation of patches is believed if their mean score is at least ``SURE_SCORE``, or if their median blur is at
 most ``SHARP_BLUR`` short semi-axes. Measured with superpoint-small on training photographs: box blur of half a disc's
 width turns mushrooms, all of an image alike, at scores of 0.65; right orientations have scores over 0.95."""
+FEW, FEW_COST = 4, 3.0
+"""Up to ``FEW`` points are believed if their cost is at most ``FEW_COST`` per degree of freedom. Measured in simulated
+scenes: right points cost up to 0.4, two right ones with a false alarm 6."""
 EXCLUDED = 50.0
 """Difference of two sums of squared errors, in ``SIGMA``, from which the worse explanation is excluded."""
 MOST_PAIRS = 400_000
@@ -65,7 +68,8 @@ class BoardMatch:
     alternatives : tuple of BoardMatch
         Other matches that explain the image as well. Their own ``alternatives`` are empty.
     is_sure : bool
-        False if nothing but the orientation of the patches tells the points, and blur makes the orientation doubtful.
+        False if the points are few and fit badly, or if nothing but the orientation of the patches tells the points
+        and blur makes the orientation doubtful.
     camera : Camera or None
         Camera with which the board was found.
     frames : Frames or None
@@ -137,6 +141,11 @@ class Explanation:
     def count(self) -> int:
         """Number of frames that agree."""
         return int(self.agrees.sum())
+
+    @property
+    def cost_per_freedom(self) -> float:
+        """The cost divided by the degrees of freedom: 6 per frame that agrees, without the 8 of the homography."""
+        return self.cost / (6 * self.count - 8)
 
     @property
     def detection(self) -> Int:
@@ -311,7 +320,7 @@ def _fit(candidates: PointCandidates, rows: Int, limit: float) -> tuple[Int, Exp
             break
     squares = (off / POINT_SIGMA) ** 2 + (bent / candidates.shape) ** 2 + (scaled / candidates.scale) ** 2
     cost = float(squares[rows].sum())
-    rest = np.flatnonzero((off <= limit) & ~np.isin(candidates.point, candidates.point[rows]))
+    rest = np.flatnonzero((off <= limit / 2) & ~np.isin(candidates.point, candidates.point[rows]))
     rest = rest[~np.isin(candidates.detection[rest], candidates.detection[rows])]
     rows = np.append(rows, _unique(candidates, rest, off + 1e-6 * bent))
     rows = rows[np.argsort(candidates.detection[rows])]
@@ -352,7 +361,7 @@ def _choose(
             chosen.append([e])
         for group in rivals:
             best = group[0]
-            limit = best.cost + EXCLUDED * max(1.0, best.cost / (6 * best.count - 8))
+            limit = best.cost + EXCLUDED * max(1.0, best.cost_per_freedom)
             if e.count == best.count and e.cost <= limit and not any(_are_equal(e, o) for o in group):
                 group.append(e)
 
@@ -363,6 +372,7 @@ def _choose(
         straight = frames[e.detection]
         straight = replace(straight, A=straight.A @ c.turn)
         is_sure = _has_sharp_patches(found) or not _depends_on_frames(c.point, board)
+        is_sure &= e.count > FEW or e.cost_per_freedom <= FEW_COST
         return BoardMatch(
             board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), is_sure, camera, straight
         )
@@ -386,7 +396,7 @@ def _depends_on_frames(points: Int, board: Board) -> bool:
     Four points fit any four points of their identities. More points only fit a rotation of the whole board.
     """
     ids = [k.patch_id for k in board.keypoints]
-    if len(points) <= 4 and any(ids.count(ids[n]) > 1 for n in points):
+    if len(points) <= FEW and any(ids.count(ids[n]) > 1 for n in points):
         return True
     return bool(board_turns_deg(board, by_place=True))
 
