@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.boards.candidates import PointCandidates, confirm_pairs, make_candidates, homography_errors
+from kpbench.boards.candidates import PointCandidates, confirm_pairs, homography_errors, make_candidates
 from kpbench.boards.frames import POINT_SIGMA, Frames, fit_homography, straighten
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
