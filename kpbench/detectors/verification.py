@@ -99,7 +99,7 @@ def verify_candidates(
     patches: Sequence[Patch],
     threads: int = 0,
     octave: Int | None = None,
-    weights: Path = WEIGHTS,
+    weights: Path | None = None,
 ) -> VerifiedCandidates:
     """Compare candidates with the likely designs, and fit the candidates that look like a patch.
 
@@ -119,8 +119,8 @@ def verify_candidates(
     octave : ndarray of shape (n,), int64, optional
         Pyramid level of the picture in which each candidate was found: 1 if the picture had half the size of the image.
         The networks see the candidate in this picture. None: all were found in the image itself.
-    weights : Path
-        Folder of the three networks.
+    weights : Path, optional
+        Folder of the three networks. None: the shipped networks.
 
     Returns
     -------
@@ -165,7 +165,7 @@ def _count_near(hypotheses: Hypotheses, xy: Float, octave: Int) -> Int:
 
 
 def find_ellipses(
-    pyramids: Pyramids, xy: Float, threads: int = 0, octave: Int | None = None, weights: Path = WEIGHTS
+    pyramids: Pyramids, xy: Float, threads: int = 0, octave: Int | None = None, weights: Path | None = None
 ) -> tuple[Float, Float, Float]:
     """Find the ellipse that a patch at each place would fill.
 
@@ -191,7 +191,7 @@ def find_ellipses(
     for first in range(0, len(xy), PLACES_PER_BLOCK):
         block = np.s_[first : first + PLACES_PER_BLOCK]
         given = {"surroundings": sample_surroundings(pyramids.smooth, xy[block], octave=octave[block])}
-        log_odds, shift, log_map = _open(weights / f"{ELLIPSE}.onnx", threads).run(None, given)
+        log_odds, shift, log_map = _open((weights or WEIGHTS) / f"{ELLIPSE}.onnx", threads).run(None, given)
         of_octave = np.eye(2) * 2.0 ** octave[block, None, None]
         parts.append((*move_poses(xy[block], of_octave, shift, log_map), _clip_log_odds(log_odds)))
     centre, A, every_log_odds = (np.concatenate(column) for column in zip(*parts, strict=True))
@@ -231,7 +231,7 @@ def propose_poses(
     patches: Sequence[Patch],
     threads: int = 0,
     octave: Int | None = None,
-    weights: Path = WEIGHTS,
+    weights: Path | None = None,
 ) -> Hypotheses:
     """Return hypotheses: the best two poses at every place that may lie on a patch.
 
@@ -328,7 +328,7 @@ def _fit_level(A: Float, designs: Sequence[Patch], levels: int) -> Int:
 
 
 def judge(
-    network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0, weights: Path = WEIGHTS
+    network: str, hypotheses: Hypotheses, patches: Sequence[Patch], threads: int = 0, weights: Path | None = None
 ) -> tuple[Float, Hypotheses]:
     """Run a judge, ``FIRST_JUDGE`` or ``SECOND_JUDGE``, on hypotheses.
 
@@ -342,7 +342,7 @@ def judge(
     if not len(hypotheses):
         return np.zeros(0), hypotheses
     blocks = (hypotheses[n : n + PLACES_PER_BLOCK] for n in range(0, len(hypotheses), PLACES_PER_BLOCK))
-    session = _open(weights / f"{network}.onnx", threads)
+    session = _open((weights or WEIGHTS) / f"{network}.onnx", threads)
     parts = [session.run(None, judge_inputs(block, patches)) for block in blocks]
     log_odds, shift, log_map = (np.concatenate(column) for column in zip(*parts, strict=True))
     xy, A = move_poses(hypotheses.xy, hypotheses.A, shift, log_map)

@@ -66,7 +66,7 @@ def train_judges(
     out: Path,
     *,
     detector: Path | None = None,
-    weights: Path = WEIGHTS,
+    weights: Path | None = None,
     epochs: int = 10,
     batch: int = 256,
     from_shipped: bool = False,
@@ -83,8 +83,8 @@ def train_judges(
     detector : Path, optional
         File of ``kpbench export-model`` that holds the detector whose candidates are judged. None: the detector
         ``superpoint-small``.
-    weights : Path
-        Folder of the ellipse network, and of the earlier first judge, if there is one.
+    weights : Path, optional
+        Folder of the ellipse network, and of the earlier first judge, if there is one. None: the shipped networks.
 
     Raises
     ------
@@ -104,11 +104,9 @@ def train_judges(
     if threads:
         torch.set_num_threads(threads)
     patches, sets = load_places_detector(detector).patches, [*datasets, test]
+    look = partial(collect_looks, detector, weights or WEIGHTS)
     looks = [
-        map_images(
-            partial(collect_looks, detector, weights), part, repeat(part is not test, len(part)), workers, f"look {n}"
-        )
-        for n, part in enumerate(sets)
+        map_images(look, part, repeat(part is not test, len(part)), workers, f"look {n}") for n, part in enumerate(sets)
     ]
     settings = _Settings(patches, epochs, batch, from_shipped, say)
     first = _train_first([image for part in looks[:-1] for image in part], settings)
