@@ -45,7 +45,7 @@ ids = 4
 [[phases]]
 samples = 120
 """
-TIMES = re.compile(rb'"(?:seconds|command|date)": *[^,}]*')
+TIMES = re.compile(rb'"(?:seconds|command|date|ms)": *[^,}]*')
 
 
 @dataclass(frozen=True)
