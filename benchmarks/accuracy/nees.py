@@ -33,7 +33,7 @@ from kpbench.camera import load_camera_preset
 from kpbench.dataset.shard import Sample
 from kpbench.fitting import build_pyramid
 from kpbench.types import Float, UInt8
-from kpbench.workers import use_one_thread
+from kpbench.workers import use_threads
 
 NEAR = 0.1
 """Largest distance of a matched detection from its centre, in radii."""
@@ -63,14 +63,17 @@ def linear_map(H: Float) -> Float:
 
 def fit_truth(sample: Sample) -> Detections:
     """Fit the true patches from poses with random errors: normal, as large as those of superpoint-small."""
-    rng, k, starts = np.random.default_rng(sample.scene_id), sample.keypoints, []
+    rng, k, starts = np.random.default_rng(max(sample.scene_id, 0)), sample.keypoints, []
     for point in k:
         A = linear_map(point["H_patch2image"])
         turned = A @ (np.eye(2) + rng.normal(0, START_DEVIATION, (2, 2)))
         starts.append(((point["x"], point["y"]) + A @ rng.normal(0, START_DEVIATION, 2), turned))
+    if not starts:
+        return Detections(np.zeros((0, 2)), np.zeros(0), k["patch_id"])
     xy, A = (np.array(column) for column in zip(*starts, strict=True))
     patches = [shipped_patches()[n] for n in k["patch_id"]]
-    found = kpbench.fit(build_pyramid(sample.image, 0), xy, A, patches)
+    grey = sample.image if sample.image.ndim == 2 else cv2.cvtColor(sample.image, cv2.COLOR_RGB2GRAY)
+    found = kpbench.fit(build_pyramid(grey, 0), xy, A, patches)
     return Detections(found.xy, found.ncc, k["patch_id"], found.A, found.covariance, found.blur_px)
 
 
@@ -157,7 +160,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=0)
     parser.add_argument("--detectors", default="superpoint-small,superpoint,template")
     options = parser.parse_args()
-    use_one_thread()
+    use_threads(1)
     cv2.setNumThreads(1)
     names = options.detectors.split(",")
     detectors = {name: fit_truth if name == "fit" else of_image(kpbench.load_detector(name)) for name in names}

@@ -103,21 +103,55 @@ def rasterise_edges(
         mean of the copies' covered fractions. The outer polygons of all copies run in one direction. Empty: one copy
         of each region.
     """
+    planes = rasterise_with_derivatives(start, end, owner, boxes, np.zeros((0, owner.size)), layers)
+    return [plane[0] for plane in planes]
+
+
+def rasterise_with_derivatives(
+    start: Float,
+    end: Float,
+    owner: NDArray[np.int64],
+    boxes: Sequence[Box],
+    gradients: Float,
+    layers: Sequence[int] = (),
+) -> list[Float]:
+    """Return the covered fractions, and their derivatives with respect to k unknowns that move the edges.
+
+    If an edge moves by v px, the area between its old and its new place is the cross product of v and the edge. The
+    derivative of a pixel's coverage is therefore the sum of (v_x step_y - v_y step_x) over the pieces of edges in it.
+
+    Parameters
+    ----------
+    start, end, owner, boxes, layers
+        As in :func:`rasterise_edges`. Outer polygons run from x to y.
+    gradients : ndarray of shape (k, N)
+        Derivative of the area that each edge moves across.
+
+    Returns
+    -------
+    list of ndarray of shape (1 + k, height, width)
+        One array a box: the covered fraction, and its derivatives.
+    """
     x, y, width, height = np.array(boxes, np.int64).reshape(-1, 4).T
     base = np.concatenate([[0], np.cumsum(width * height)])
     corner = np.stack([x - 0.5, y - 0.5]).take(owner, axis=1)
-    signed = _accumulate(start - corner, end - corner, base.take(owner), width.take(owner), int(base[-1]))
+    place = base.take(owner), width.take(owner), int(base[-1])
+    planes = _accumulate(start - corner, end - corner, *place, gradients)
     # a region's entries sum to zero, so one running sum serves all regions; outer polygons may run in either direction,
     # so the sum may be negative
-    covered = np.cumsum(signed)
+    covered = np.cumsum(planes[0], out=planes[0])
     for n, count in enumerate(layers):
         covered[base[n] : base[n + 1]] *= 1 / count
     np.minimum(np.abs(covered, out=covered), 1.0, out=covered)
-    return [covered[base[n] : base[n + 1]].reshape(h, w) for n, (_, _, w, h) in enumerate(boxes)]
+    return [planes[:, base[n] : base[n + 1]].reshape(-1, h, w) for n, (_, _, w, h) in enumerate(boxes)]
 
 
-def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDArray[np.int64], total: int) -> Float:
-    """Return an array whose running sum along the rows is the signed coverage.
+def _accumulate(
+    start: Float, end: Float, offset: NDArray[np.int64], stride: NDArray[np.int64], total: int, amounts: Float
+) -> Float:
+    """Return rows whose first has the signed coverage as its running sum; the others are sums of amounts in each pixel.
+
+    ``amounts`` (k, N) are spread evenly along each edge.
 
     Edges are in px of the frame of their box, in which pixel i spans [i, i + 1).
     """
@@ -136,6 +170,7 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
         step = np.concatenate([step.take(short_edges, axis=1), part_step], axis=1)
         order = np.concatenate([short_edges, edge])
         offset, stride, end = offset.take(order), stride.take(order), start + step
+        amounts = amounts.take(order, axis=1) / parts.take(order)
     first, last = np.floor(start), np.floor(end)
     with np.errstate(divide="ignore", invalid="ignore"):
         cut = np.where(first != last, (np.maximum(first, last) - start) / step, 0.0)
@@ -161,9 +196,13 @@ def _accumulate(start: Float, end: Float, offset: NDArray[np.int64], stride: NDA
     cut_ends = (values.take(cut_parts) for values in (*start, *step))
     cut_pieces = measure(*cut_ends, begin, until, offset.take(cut_parts), stride.take(cut_parts))
     pixel, own, right = (np.concatenate(pair) for pair in zip(last_pieces, cut_pieces, strict=True))
-    areas = np.bincount(pixel, own, total + 1)
-    areas += np.bincount(pixel + 1, right, total + 1)
-    return np.asarray(areas[:total], np.float64)
+    shares = np.concatenate([1.0 - late, until - begin])
+    planes = np.empty((1 + len(amounts), total))
+    planes[0] = (np.bincount(pixel, own, total + 1) + np.bincount(pixel + 1, right, total + 1))[:total]
+    for plane, amount in zip(planes[1:], amounts, strict=True):
+        of_pieces = np.concatenate([amount, amount.take(cut_parts)]) * shares
+        plane[:] = np.bincount(pixel, of_pieces, total + 1)[:total]
+    return planes
 
 
 def clip_to_image(box: Box, image: NDArray[Any]) -> tuple[tuple[slice, slice], tuple[slice, slice]]:

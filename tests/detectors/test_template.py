@@ -67,7 +67,7 @@ def test_it_finds_every_design_to_a_few_hundredths_of_a_pixel(rendered, detector
         lambda image: noise(image, np.random.default_rng(0), 30),
         lambda image: dimming(image, 40),
         lambda image: blur(image, 5),
-        lambda image: motion_blur(image, 6.0, 30.0),
+        lambda image: motion_blur(image, 5.0, 30.0),
     ],
     ids=["noise", "dimming", "blur", "motion"],
 )

@@ -70,19 +70,40 @@ def test_a_large_patch_which_is_fitted_in_a_coarser_level_has_the_covariance_of_
     assert 0.6 < ratio < 2.4
 
 
-def test_light_that_falls_off_widens_the_covariance_by_what_it_moves_the_centre():
+def test_light_that_falls_off_does_not_move_the_centre():
+    """Without the light among the unknowns, the centre moves by 0.05 px."""
     clean, xy = render_design(PATCHES[WHEEL], 25.0 * rotation(20), 1.0)
     sloped = clean * (1 + 0.1 * (np.arange(clean.shape[1]) - xy[0]) / 25)
-    noise = np.random.default_rng(0).normal(0, 1, clean.shape)
-    even, uneven = (
-        fit(
-            build_pyramid(np.rint(image + noise).astype(np.uint8), 0), xy[None], 25.0 * rotation(20)[None], [PATCHES[2]]
-        )
-        for image in (clean, sloped)
-    )
-    error = uneven.xy[0] - xy
-    assert np.hypot(*error) > 5 * np.sqrt(np.trace(even.covariance[0]))
-    assert error @ np.linalg.solve(uneven.covariance[0], error) < 6
+    noisy = np.rint(sloped + np.random.default_rng(0).normal(0, 1, clean.shape)).astype(np.uint8)
+    found = fit(build_pyramid(noisy, 0), xy[None], 25.0 * rotation(20)[None], [PATCHES[WHEEL]])
+    assert np.hypot(*(found.xy[0] - xy)) < 0.03
+
+
+def test_motion_blur_widens_the_covariance_by_what_it_moves_the_centre():
+    clean, xy = render_design(PATCHES[WHEEL], 25.0 * rotation(20), 1.0)
+    moved = cv2.filter2D(clean, -1, np.full((1, 7), 1 / 7))
+    image = np.rint(moved + np.random.default_rng(0).normal(0, 1, clean.shape)).astype(np.uint8)
+    found = fit(build_pyramid(image, 0), xy[None], 25.0 * rotation(20)[None], [PATCHES[WHEEL]])
+    error = found.xy[0] - xy
+    assert error @ np.linalg.solve(found.covariance[0], error) < 9
+
+
+@pytest.mark.parametrize("patch", PATCHES[:2], ids=lambda patch: patch.name)
+def test_a_lens_that_bends_does_not_move_the_centre(patch):
+    """Brown's k1 = -0.2 in an image 400 px wide, 150 px from its middle: the rim moves by up to 0.3 px."""
+    A, xy, factor = 30.0 * rotation(20), np.array([350.0, 200.0]), 4
+    middle, focal = np.array([199.5, 199.5]), 400.0
+    y, x = (np.mgrid[: 80 * factor, : 80 * factor] + 0.5) / factor - 0.5
+    seen = np.stack([x + 310, y + 160], axis=-1)
+    from_centre = seen - xy
+    bent = -0.2 / focal**2 * (from_centre**2).sum(axis=-1)[..., None] * (xy - middle)
+    uv = (from_centre - bent) @ np.linalg.inv(A).T
+    ink = np.where(np.hypot(*np.moveaxis(uv, -1, 0)) > 1, 0.5, patch.is_black(uv))
+    grey = cv2.GaussianBlur(190 - 130 * cv2.resize(ink, (80, 80), interpolation=cv2.INTER_AREA), (0, 0), 0.8)
+    image = np.full((400, 400), 125.0)
+    image[160:240, 310:390] = grey
+    found = fit(build_pyramid(np.rint(image).astype(np.uint8), 0), xy[None] + 0.1, A[None], [patch])
+    assert np.hypot(*(found.xy[0] - xy)) < 0.025
 
 
 def test_without_a_step_the_covariance_is_that_of_the_start():
@@ -113,7 +134,7 @@ def image():
 def test_the_shipped_detectors_fill_frame_covariance_and_blur(name, image):
     found = kpbench.load_detector(name)(image)
     assert len(found) == 1
-    assert np.linalg.norm(found.A_patch2image[0], 2) == pytest.approx(20, rel=0.05)
+    assert np.linalg.norm(found.A_patch2image[0], 2) == pytest.approx(20, rel=0.1)
     assert 0.002 < np.sqrt(np.trace(found.covariance[0]) / 2) < 0.05
     assert found.blur_px[0] == pytest.approx(1.0, abs=0.2)
 

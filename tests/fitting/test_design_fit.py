@@ -46,7 +46,7 @@ def test_no_blur_moves_the_centre_and_its_width_is_found(patch):
     xy, A = np.array([45.2, 44.6]), rotation(10) @ np.diag([26.0, 20.0]) @ rotation(140)
     image = blur(render_design(patch, A, xy), 7)
     found = fit_one(image, xy + np.array([0.4, 0.3]), A, patch)
-    assert np.hypot(*(found.xy[0] - xy)) < 0.03
+    assert np.hypot(*(found.xy[0] - xy)) < 0.05
     assert found.blur_px[0] == pytest.approx(2.0, abs=0.25)  # a box of 7 px: sqrt((49 - 1) / 12)
 
 
