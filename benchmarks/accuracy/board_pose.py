@@ -26,7 +26,7 @@ import kpbench
 from kpbench import Board, Detections, Predictions, SuiteConfig, load_suite
 from kpbench.boards import BoardPose, pose_distance
 from kpbench.patches import BoardKeypoint, BoardLike
-from kpbench.workers import use_one_thread
+from kpbench.workers import use_threads
 
 MIXED = (0, 1, 2, 3, 1, 2)
 """Designs of the mixed board."""
@@ -140,7 +140,7 @@ def main() -> None:
     parser.add_argument("--size")
     parser.add_argument("--detector", default="superpoint-small")
     options = parser.parse_args()
-    use_one_thread()
+    use_threads(1)
     cv2.setNumThreads(1)
     size = None if options.size is None else tuple(map(int, options.size.split("x")))
     suite = BoardSuite(load_suite("paper-v1"), options.scenes, options.seed, size, backgrounds=options.backgrounds)

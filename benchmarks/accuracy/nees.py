@@ -33,7 +33,7 @@ from kpbench.camera import load_camera_preset
 from kpbench.dataset.shard import Sample
 from kpbench.fitting import build_pyramid
 from kpbench.types import Float, UInt8
-from kpbench.workers import use_one_thread
+from kpbench.workers import use_threads
 
 NEAR = 0.1
 """Largest distance of a matched detection from its centre, in radii."""
@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--cameras", type=int, default=0)
     parser.add_argument("--detectors", default="superpoint-small,superpoint,template")
     options = parser.parse_args()
-    use_one_thread()
+    use_threads(1)
     cv2.setNumThreads(1)
     names = options.detectors.split(",")
     detectors = {name: fit_truth if name == "fit" else of_image(kpbench.load_detector(name)) for name in names}

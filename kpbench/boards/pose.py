@@ -229,7 +229,7 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
         information = transposed @ J
         damped = information * (1 + damping[:, None, None] * np.eye(6))
         step = np.asarray(np.linalg.solve(damped, transposed @ error.reshape(len(R), -1, 1))[..., 0], np.float64)
-        R_new, t_new = _exp(step[:, :3]) @ R, t + step[:, 3:]
+        R_new, t_new = exp_rotation(step[:, :3]) @ R, t + step[:, 3:]
         error_new, points_new = errors(R_new, t_new)
         cost_new = cost_of(error_new)
         better = cost_new <= cost
@@ -257,7 +257,7 @@ def _jacobian(points: Float, whiten: Float) -> Float:
     return np.asarray(whiten @ J).reshape(len(points), -1, 6)
 
 
-def _exp(rotation_vector: Float) -> Float:
+def exp_rotation(rotation_vector: Float) -> Float:
     """Return rotation matrices (K, 3, 3) of rotation vectors (K, 3), by Rodrigues' formula."""
     angle = np.sqrt((rotation_vector**2).sum(axis=1))
     x, y, z = (rotation_vector / np.maximum(angle, 1e-300)[:, None]).T
