@@ -28,8 +28,6 @@ FINE_PX, FINE_STEPS = 100.0, 4
 """The last ``FINE_STEPS`` steps use the finest pyramid level in which this semi-axis is at most ``FINE_PX`` px."""
 SETTLED_STEP = 0.002
 """If a step changes centre and map by at most this, in short semi-axes, no further step is taken in the same level."""
-SETTLED_REFIT = 0.01
-"""The same for :func:`refit`."""
 LEVEL_BLUR_PX = 0.6
 """Standard deviation of the pyramid's own blur in every level but level 0, px of the level."""
 MODEL_REACH = 1.3
@@ -139,54 +137,6 @@ def fit(levels: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch]
                 image, grain = levels[level[n]], LEVEL_GRAIN if level[n] else 1.0
                 states[n] = _step(states[n], image, box, cover, patches[n].extent, left, grain)
         states = [_scale_state(state, n) for state, n in zip(states, level, strict=True)]
-    return _collect(states)
-
-
-def refit(
-    windows: Sequence[Float32], xy: Float, A: Float, patches: Sequence[Patch], blur_px: Float, steps: int = 2
-) -> Fit:
-    """Fit designs to windows of an image in one or two steps, from poses and blurs that are nearly right.
-
-    Parameters
-    ----------
-    windows : sequence of ndarray of shape (h, w), float32
-        One per patch.
-    xy, A, patches
-        As for :func:`fit`, in px of the windows.
-    blur_px : ndarray of shape (N,)
-        Standard deviations of the blur to start from, px of the windows.
-    steps : int
-        Largest number of steps.
-
-    Returns
-    -------
-    Fit
-        In px of the windows. ``ncc``, ``noise`` and inks are those before the last step.
-
-    Examples
-    --------
-    >>> import numpy as np, kpbench
-    >>> from kpbench.fitting.design_fit import refit
-    >>> patch = kpbench.shipped_patches()[0]
-    >>> v, u = (np.mgrid[:64, :64] - 31.5) / 20.0
-    >>> black = patch.is_black(np.stack([u, v], axis=-1))
-    >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.float32)
-    >>> found = refit([image], np.array([[31.6, 31.4]]), np.array([np.eye(2) * 20.0]), [patch], np.array([0.5]))
-    >>> found.xy.round(1)
-    array([[31.5, 31.5]])
-    """
-    covariance, blur = start_covariance(A), blur_px.tolist()
-    states = [_State(xy[n], A[n], A[n], np.zeros(2), blur[n], covariance=covariance[n]) for n in range(len(patches))]
-    for _ in range(steps):
-        live = [n for n, state in enumerate(states) if state.moved > SETTLED_REFIT]
-        boxes = [_bounding_box(states[n], patches[n].extent) for n in live]
-        covers = rasterise([_black_polygons(states[n], patches[n]) for n in live], boxes)
-        for n, box, cover in zip(live, boxes, covers, strict=True):
-            states[n] = _step(states[n], windows[n], box, cover, patches[n].extent, 1, LEVEL_GRAIN)
-    return _collect(states)
-
-
-def _collect(states: Sequence[_State]) -> Fit:
     columns = [np.array([getattr(s, name) for s in states]) for name in ("black", "white", "blur", "ncc", "noise")]
     xy, A, C = (np.array([getattr(s, name) for s in states]) for name in ("xy", "A", "covariance"))
     black, white, blur, ncc, noise = columns

@@ -34,6 +34,8 @@ LEAST_RADIUS_PX = 3.0
 """Short semi-axis of the smallest patch that is looked for in a window, px."""
 LEAST_NCC = 0.7
 """Least correlation of a fitted patch with its design. What is no patch seldom reaches 0.6."""
+LEAST_CONTRAST = 4.0
+"""Least contrast of a patch, white minus black, grey levels."""
 LARGEST_MOVE = 0.2
 """Largest distance of the fitted centre from the aligned one, in short semi-axes."""
 LEAST_SHARE = 0.5
@@ -215,7 +217,7 @@ class Tracker:
             search = WindowSearch(self._templates, self._design[points])
             windows = cut_windows(image, xy, A, self._extent[points], reach)
             fit, moved = search.find(windows, xy, A, self._blur_px[points], shift)
-            good = np.flatnonzero((fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.white > fit.black))
+            good = np.flatnonzero((fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.contrast > LEAST_CONTRAST))
             if len(good) < max(LEAST_POSE_POINTS, LEAST_SHARE * len(points)) and not shift:
                 continue
             ids = np.array([k.patch_id for k in self.board.keypoints])[points]

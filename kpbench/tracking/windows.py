@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import WHOLE_RADIUS_PX, Poses, align_poses, short_semi_axis
-from kpbench.fitting.design_fit import Fit, refit
 from kpbench.fitting.pyramid import choose_level, normalise_rows, sample_pyramid
+from kpbench.fitting.sampled_fit import SampledFit, fit_samples
 from kpbench.fitting.templates import DesignTemplates
 from kpbench.images import to_grey
 from kpbench.patches.design import Patch
@@ -25,8 +25,6 @@ WINDOW_RADIUS_PX = 24.0
 """Largest long semi-axis of a patch, rim included, in its window, px of the window."""
 RIM = 1.4
 """Part of a window that the patch itself takes, in long semi-axes."""
-FINE_RADIUS_PX = 12.0
-"""Short semi-axis at which the last step of the alignment compares, px."""
 SHIFT_STEP = 0.35
 """Distance of the shifts that are tried, in short semi-axes. The alignment finds its way from half as far."""
 
@@ -118,7 +116,7 @@ class WindowSearch:
         """The design of each patch."""
         return [self.templates.patches[n] for n in self.design]
 
-    def find(self, windows: Windows, xy: Float, A: Float, blur_px: Float, largest_shift: float) -> tuple[Fit, Float]:
+    def find(self, windows: Windows, xy: Float, A: Float, blur_px: Float, largest_shift: float) -> tuple[SampledFit, Float]:
         """Find patches near their predicted poses.
 
         Parameters
@@ -134,7 +132,7 @@ class WindowSearch:
 
         Returns
         -------
-        fit : Fit
+        fit : SampledFit
             In px of the image.
         moved : ndarray of shape (N,)
             Distance of the fitted centre from the aligned one, in short semi-axes.
@@ -147,16 +145,11 @@ class WindowSearch:
             xy = xy + self._find_shift(levels, xy, A, largest_shift) / windows.scale[:, None] * windows.scale.mean()
         poses = Poses(xy, A, self.design, np.zeros(len(xy)))
         poses = align_poses(levels, poses, self.templates.whole, 3, WHOLE_RADIUS_PX)
-        poses = align_poses(levels, poses, self.templates.whole, 1, FINE_RADIUS_PX)
-        n, side = len(xy), windows.side
-        down = np.column_stack([np.zeros(n), side * np.arange(n)])
-        tiles = list(windows.strip.reshape(n, side, side))
-        fit = refit(tiles, poses.xy - down, poses.A, self.patches, blur_px / windows.scale)
-        moved = np.linalg.norm(fit.xy + down - poses.xy, axis=1) / np.maximum(short_semi_axis(poses.A), 0.5)
-        centres, maps = windows.to_image(fit.xy + down, fit.A)
+        fit = fit_samples(windows.strip, poses.xy, poses.A, self.patches, blur_px / windows.scale)
+        moved = np.linalg.norm(fit.xy - poses.xy, axis=1) / np.maximum(short_semi_axis(poses.A), 0.5)
+        centres, maps = windows.to_image(fit.xy, fit.A)
         covariance = fit.covariance * windows.scale[:, None, None] ** 2
-        of_image = fit.black, fit.white, fit.blur_px * windows.scale, fit.ncc, fit.noise, covariance
-        return Fit(centres, maps, *of_image), moved
+        return SampledFit(centres, maps, fit.contrast, fit.blur_px * windows.scale, fit.ncc, covariance), moved
 
     def _find_shift(self, levels: Sequence[Float32], xy: Float, A: Float, largest: float) -> Float:
         """Return the shift (2,), px of the strip, at which the designs agree best with the windows."""
