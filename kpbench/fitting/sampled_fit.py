@@ -65,7 +65,7 @@ class SampledFit:
 
 
 def fit_samples(
-    image: Float32, xy: Float, A: Float, patches: Sequence[Patch], blur_px: Float, steps: int = 3
+    image: Float32, xy: Float, A: Float, patches: Sequence[Patch], blur_px: Float, steps: int = 2
 ) -> SampledFit:
     """Fit designs to the pixels of an image.
 

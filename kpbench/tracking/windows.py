@@ -144,7 +144,7 @@ class WindowSearch:
         if largest_shift:
             xy = xy + self._find_shift(levels, xy, A, largest_shift) / windows.scale[:, None] * windows.scale.mean()
         poses = Poses(xy, A, self.design, np.zeros(len(xy)))
-        poses = align_poses(levels, poses, self.templates.whole, 3, WHOLE_RADIUS_PX)
+        poses = align_poses(levels, poses, self.templates.whole, 2, WHOLE_RADIUS_PX)
         fit = fit_samples(windows.strip, poses.xy, poses.A, self.patches, blur_px / windows.scale)
         moved = np.linalg.norm(fit.xy - poses.xy, axis=1) / np.maximum(short_semi_axis(poses.A), 0.5)
         centres, maps = windows.to_image(fit.xy, fit.A)
