@@ -23,13 +23,15 @@ POSE_SUFFIXES = (".csv", ".jsonl")
 MATRIX_COLUMNS = [f"rotation_{i}{j}" for i in "123" for j in "123"]
 COVARIANCE_COLUMNS = [f"covariance_{i}{j}" for i in "123456" for j in "123456" if j >= i]
 MOTION_KEYS = ("rotation", "quaternion_xyzw", "translation_mm")
-OTHER_KEYS = ("covariance", "reprojection_rms_px", "points", "ambiguous", "second", "state")
+OTHER_KEYS = ("covariance", "reprojection_rms_px", "points", "ambiguous", "second", "state", "filtered")
+MOTION_COLUMNS = ("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm")
 POSE_COLUMNS = (
     *("image_id", "file", "frame_index", "time_s", "board", *MATRIX_COLUMNS),
-    *("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm", *COVARIANCE_COLUMNS),
+    *(*MOTION_COLUMNS, *COVARIANCE_COLUMNS),
     *("reprojection_rms_px", "points", "ambiguous"),
-    *("second_qx", "second_qy", "second_qz", "second_qw", "second_tx_mm", "second_ty_mm", "second_tz_mm"),
+    *(f"second_{name}" for name in MOTION_COLUMNS),
     *("state", "reason"),
+    *(f"filtered_{name}" for name in (*MOTION_COLUMNS, *COVARIANCE_COLUMNS)),
 )
 """Columns of a CSV file. A covariance is symmetric: its upper triangle is listed."""
 
@@ -95,8 +97,11 @@ def _to_dict(record: PoseRecord) -> dict[str, Any]:
             "points": pose.points,
             "ambiguous": pose.ambiguous,
             "second": None if pose.second is None else _motion(pose.second),
-            "state": "seen",
+            "state": record.state,
         }
+    if record.filtered is not None:
+        filtered = _motion(record.filtered) | {"covariance": record.filtered.covariance.tolist()}
+        content |= {"state": record.state, "filtered": filtered}
     return content | {"reason": record.reason or None}
 
 
@@ -115,10 +120,9 @@ def _encode_csv(records: Sequence[PoseRecord]) -> bytes:
         row |= {"file": escape_csv(content["file"] or ""), "board": escape_csv(record.board)}
         if record.pose is not None:
             row |= dict(zip(MATRIX_COLUMNS, record.pose.rotation.ravel().tolist(), strict=True))
-            upper = [v for k, line in enumerate(content["covariance"]) for v in line[k:]]
-            row |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
             row |= _flatten(content, "") | _flatten(content["second"], "second_")
             row["ambiguous"] = int(record.pose.ambiguous)
+        row |= _flatten(content["filtered"], "filtered_")
         writer.writerow(row)
     return encode_utf8(text.getvalue())
 
@@ -126,6 +130,9 @@ def _encode_csv(records: Sequence[PoseRecord]) -> bytes:
 def _flatten(motion: dict[str, Any] | None, prefix: str) -> dict[str, float]:
     if motion is None:
         return {}
-    names = ("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm")
     values = [*motion["quaternion_xyzw"], *motion["translation_mm"]]
-    return {f"{prefix}{name}": value for name, value in zip(names, values, strict=True)}
+    row = dict(zip(MOTION_COLUMNS, values, strict=True))
+    if "covariance" in motion:
+        upper = [v for k, line in enumerate(motion["covariance"]) for v in line[k:]]
+        row |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+    return {f"{prefix}{name}": value for name, value in row.items()}

@@ -34,7 +34,7 @@ class Distortion(click.ParamType[tuple[float, ...]]):
     "--images",
     type=int,
     help="Number of base scenes. Each scene is rendered with every patch under every rung. "
-    "Default: 500 for shipped suites, else as in the .toml file.",
+    "Default: 500 for shipped suites, 10 films for video-v1, else as in the .toml file.",
 )
 @SEED
 @BACKGROUNDS
@@ -65,7 +65,7 @@ def suite(
 ) -> None:
     """Write the images of a benchmark suite into a dataset folder.
 
-    NAME is paper-v1, extended-v1, camera-v1, or a .toml file of your own.
+    NAME is paper-v1, extended-v1, camera-v1, video-v1, or a .toml file of your own.
 
     \b
     Examples:

@@ -110,7 +110,7 @@ def fit_samples(
         model = J[:, 1] + np.einsum("nk,nkm->nm", uneven.astype(np.float32), J[:, 12:])
         grey = _sample(image, xy, A)
         reach = np.maximum(1 - (MARGIN_PX + MARGIN_BLURS * blur_px) / minor, 0.5)
-        inside = (_RADIUS < reach[:, None]).astype(np.float32)
+        inside = (reach[:, None] > _RADIUS).astype(np.float32)
         black_white, ncc, count = _regress(grey, model, inside)
         contrast = np.maximum(black_white[:, 1], 1.0)[:, None]
         residual = (grey - black_white[:, :1].astype(np.float32)) / contrast.astype(np.float32) - model
@@ -152,7 +152,9 @@ def fit_samples(
 
 def _sample(image: Float32, xy: Float, A: Float) -> Float32:
     """Return the grey levels (N, M) at the sample points of N patches."""
-    x, y = (A[:, k].astype(np.float32) @ POINTS.T.astype(np.float32) + xy[:, k, None].astype(np.float32) for k in (0, 1))
+    x, y = (
+        A[:, k].astype(np.float32) @ POINTS.T.astype(np.float32) + xy[:, k, None].astype(np.float32) for k in (0, 1)
+    )
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 

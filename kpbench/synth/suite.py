@@ -27,7 +27,16 @@ from kpbench.render.background import Background, PhotoFolder, describe_backgrou
 from kpbench.render.board_exposure import ExposedBoard
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
-from kpbench.seeds import SUITE_BACKGROUND, SUITE_CAMERA, SUITE_EFFECT, SUITE_FIELD, SUITE_FILM, SUITE_SCENE, SUITE_SENSOR, stream
+from kpbench.seeds import (
+    SUITE_BACKGROUND,
+    SUITE_CAMERA,
+    SUITE_EFFECT,
+    SUITE_FIELD,
+    SUITE_FILM,
+    SUITE_SCENE,
+    SUITE_SENSOR,
+    stream,
+)
 from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
 from kpbench.synth.film import FILM_KEYS, draw_bar, draw_path, film_record
 from kpbench.synth.finish import degrade_scene, discs_of

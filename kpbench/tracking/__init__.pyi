@@ -1,4 +1,6 @@
-
+from .films import TrackRun as TrackRun
+from .films import draw_pose as draw_pose
+from .films import track_images as track_images
 from .motion_filter import PoseFilter as PoseFilter
 from .tracker import TrackedPose as TrackedPose
 from .tracker import Tracker as Tracker

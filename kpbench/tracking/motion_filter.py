@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from kpbench.boards.pose import BoardPose, exp_rotation, rotation_vector
-from kpbench.types import Float
 
 TURN_ACCELERATION, ACCELERATION = 15.0, 5000.0
 """Standard deviations of the accelerations, rad/s² and mm/s²: those of a board in a hand that moves fast."""

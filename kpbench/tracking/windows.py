@@ -116,7 +116,9 @@ class WindowSearch:
         """The design of each patch."""
         return [self.templates.patches[n] for n in self.design]
 
-    def find(self, windows: Windows, xy: Float, A: Float, blur_px: Float, largest_shift: float) -> tuple[SampledFit, Float]:
+    def find(
+        self, windows: Windows, xy: Float, A: Float, blur_px: Float, largest_shift: float
+    ) -> tuple[SampledFit, Float]:
         """Find patches near their predicted poses.
 
         Parameters
