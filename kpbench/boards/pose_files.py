@@ -5,14 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kpbench.boards.images import PoseRecord
 from kpbench.boards.pose import BoardPose
-from kpbench.errors import DataError
-from kpbench.files import encode_utf8
+from kpbench.errors import DataError, PredictionsError, system_reason
+from kpbench.files import encode_utf8, read_bytes
 from kpbench.text import escape_csv
 from kpbench.writing import require_writable, write_file
 
@@ -77,6 +79,91 @@ def write_poses(path: str | Path, records: Sequence[PoseRecord]) -> None:
     else:
         lines = [json.dumps({"schema": POSES_SCHEMA}), *(json.dumps(_to_dict(record)) for record in records), ""]
         write_file(path, "\n".join(lines).encode())
+
+
+def holds_poses(path: str | Path) -> bool:
+    """Return whether a file begins as a file of poses does."""
+    try:
+        with Path(path).open("rb") as file:
+            return POSES_SCHEMA.encode() in file.read(64)
+    except OSError:
+        return False
+
+
+def read_poses(path: str | Path) -> list[dict[str, Any]]:
+    """Read a file of poses.
+
+    Returns
+    -------
+    list of dict
+        Per line: ``image_id``; ``rotation`` (3 x 3) and ``translation_mm``, or None for no pose; and ``filtered``, None
+        or a dict with the same two.
+
+    Raises
+    ------
+    PredictionsError
+        If the file cannot be read, or a line is no pose. The message names the line.
+
+    Examples
+    --------
+    >>> from kpbench.boards import PoseRecord, read_poses, write_poses
+    >>> write_poses("poses.csv", [PoseRecord(0, "a.png", None, None, "grid", None, "the board was not found")])
+    >>> read_poses("poses.csv")
+    [{'image_id': 0, 'rotation': None, 'translation_mm': None, 'filtered': None}]
+    """
+    path = Path(path)
+    try:
+        lines = read_bytes(path).decode("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PredictionsError(f"{path}: cannot be read, {system_reason(error) or 'it is no text'}") from None
+    if not lines or POSES_SCHEMA not in lines[0]:
+        raise PredictionsError(f"{path}: line 1: expected the schema {POSES_SCHEMA!r}")
+    is_csv = path.suffix.lower() == ".csv"
+    rows: Iterable[Any] = csv.DictReader(lines[1:]) if is_csv else filter(str.strip, lines[1:])
+    found = list[dict[str, Any]]()
+    parse: Callable[[Any], dict[str, Any]] = _parse_csv if is_csv else _parse_json
+    for n, row in enumerate(rows, start=3 if is_csv else 2):
+        try:
+            found.append(parse(row))
+        except (ValueError, KeyError, TypeError):
+            raise PredictionsError(f"{path}: line {n}: expected a pose as kpbench writes it") from None
+    return found
+
+
+def _parse_json(line: str) -> dict[str, Any]:
+    content = json.loads(line)
+    filtered = content["filtered"]
+    return {"image_id": int(content["image_id"]), **_checked(content), "filtered": filtered and _checked(filtered)}
+
+
+def _checked(content: dict[str, Any]) -> dict[str, Any]:
+    if content["rotation"] is None:
+        return {"rotation": None, "translation_mm": None}
+    rotation, place = (np.array(content[name], np.float64) for name in ("rotation", "translation_mm"))
+    if (
+        rotation.shape != (3, 3)
+        or place.shape != (3,)
+        or not (np.isfinite(rotation).all() and np.isfinite(place).all())
+    ):
+        raise ValueError
+    return {"rotation": rotation.tolist(), "translation_mm": place.tolist()}
+
+
+def _parse_csv(row: dict[str, str]) -> dict[str, Any]:
+    def motion(prefix: str) -> dict[str, Any]:
+        values = [row[f"{prefix}{name}"] for name in MOTION_COLUMNS]
+        if not values[0]:
+            return {"rotation": None, "translation_mm": None}
+        x, y, z, w, *place = map(float, values)
+        rotation = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        return _checked({"rotation": rotation, "translation_mm": place})
+
+    filtered = motion("filtered_")
+    return {"image_id": int(row["image_id"]), **motion(""), "filtered": filtered if filtered["rotation"] else None}
 
 
 def _to_dict(record: PoseRecord) -> dict[str, Any]:

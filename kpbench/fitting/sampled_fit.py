@@ -159,7 +159,7 @@ def _sample(image: Float32, xy: Float, A: Float) -> Float32:
 
 
 def _regress(grey: Float32, model: Float32, inside: Float32) -> tuple[Float, Float, Float]:
-    """Return grey and contrast (N, 2) of a linear regression on the model, the correlation, and the number of samples."""
+    """Return grey and contrast (N, 2) of a regression on the model, the correlation, and the number of samples."""
     count = np.maximum(inside.sum(axis=1), 1)
     weight = inside / count[:, None]
     mean_grey, mean_model = (np.einsum("nm,nm->n", weight, part) for part in (grey, model))

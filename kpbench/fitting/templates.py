@@ -168,7 +168,7 @@ def draw_ink(patch: Patch, whole: bool, blur: float | None = None) -> Float32:
     radius = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
     looked_up = np.minimum(radius, 0.999) if whole else 0.5 * patch.cells[0][1]
     black = patch.is_black(points * (looked_up / radius)[..., None])
-    return np.where(black, -1.0, 1.0).reshape(_INK_PX, fine, _INK_PX, fine).mean(axis=(1, 3)).astype(np.float32)
+    return np.asarray(np.where(black, -1, 1).reshape(_INK_PX, fine, _INK_PX, fine).mean(axis=(1, 3)), np.float32)
 
 
 def look_up_ink(image: Float32, points: Float) -> Float:

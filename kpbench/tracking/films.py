@@ -97,14 +97,16 @@ def track_images(
     >>> [record.reason for record in run.records]
     ['the board was not found', 'the frame cannot be read']
     """
-    is_dataset = isinstance(source, Dataset)
-    if isinstance(source, ImageSource) and source.fps:
-        tracker.fps = source.fps
-    length = len(source) if is_dataset else source.length
-    fps, names = (None, None) if is_dataset else (source.fps, source.names)
+    problems = dict[str, str]()
+    length: int | None
+    if isinstance(source, Dataset):
+        length, fps, names, frames = len(source), None, None, _dataset_frames(source)
+    else:
+        length, fps, names, frames = source.length, source.fps, source.names, _source_frames(source)
+        problems, tracker.fps = source.problems, source.fps or tracker.fps
     run, ends_by = TrackRun([], [], []), () if length is not None else (KeyboardInterrupt,)
     with image_writer(overlay, length, fps, names) as draw, contextlib.suppress(*ends_by):
-        for frame in _dataset_frames(source) if is_dataset else _source_frames(source):
+        for frame in frames:
             if frame.starts_film:
                 tracker.reset()
             start = time.perf_counter()
@@ -114,8 +116,7 @@ def track_images(
                 raise DataError(f"{frame.file or 'image_id'} {frame.name}: {error}") from None
             run.ms.append(1000 * (time.perf_counter() - start))
             if frame.image is None:
-                problem = UNDECODABLE if is_dataset else source.problems.get(frame.name, UNDECODABLE)
-                run.failures.append((frame.name, problem))
+                run.failures.append((frame.name, problems.get(frame.name, UNDECODABLE)))
             of_frame = frame.image_id, frame.file, frame.index, frame.time_s, tracker.board.name
             run.records.append(PoseRecord(*of_frame, found.pose, found.reason, found.state, found.filtered))
             if overlay is not None:

@@ -1,9 +1,9 @@
 """A Kalman filter of a pose with constant velocity.
 
 State: rotation R and translation t of the board, angular velocity w (rad/s) and velocity v (mm/s), all in the camera
-frame. The errors are (ω, δ, w, v): the true state is ``exp([ω]×) R``, ``t + δ`` and so on. Between frames, the velocities
-change by random accelerations (Y. Bar-Shalom et al., *Estimation with Applications to Tracking and Navigation*, 2001,
-section 6.3.2: piecewise constant white acceleration).
+frame. The errors are (ω, δ, w, v): the true state is ``exp([ω]×) R``, ``t + δ`` and so on. Between frames, random
+accelerations change the velocities (Y. Bar-Shalom et al., *Estimation with Applications to Tracking and Navigation*,
+2001, section 6.3.2: piecewise constant white acceleration).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Windows of an image around predicted patches: where a patch is, and how well it agrees with its design.
 
-A window is a square of one image around one predicted patch, at the scale at which the patch has a semi-axis of at most
-``WINDOW_RADIUS_PX``. All windows of a frame have the same side and lie below each other in one image, the strip. Nothing
-else of the frame is read.
+A window is a square of the image around a predicted patch, at the scale at which the patch has a semi-axis of at most
+``WINDOW_RADIUS_PX``. All windows of a frame have the same side and lie below each other in one image, the strip.
+Nothing else of the frame is read.
 """
 
 from __future__ import annotations
