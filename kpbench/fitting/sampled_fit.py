@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
-from kpbench.fitting.covariance import LIGHT_SLOPE, UNEVEN_BLUR_PX2, start_covariance
+from kpbench.fitting.covariance import LAST_STEP_SHARE, LIGHT_SLOPE, UNEVEN_BLUR_PX2, start_covariance
+from kpbench.fitting.design_fit import EXPECTED_TONE, MARGIN_BLURS
 from kpbench.fitting.templates import draw_ink, look_up_ink
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -27,18 +28,19 @@ BLURS = 0.03 * 1.2 ** np.arange(17)
 """Blurs for which derivatives are computed, in disc radii."""
 STEP = 0.03
 """Distance of the points whose difference is a derivative, in disc radii."""
-MARGIN_PX, MARGIN_BLURS = 0.35, 1.6
-"""Width of the rim that is left out: ``MARGIN_PX`` and this many standard deviations of the blur."""
-EXPECTED_TURN, EXPECTED_TONE = 0.1, 0.25
-"""Standard deviations of a step of the affine map, as a part of it, and of the tone curve's coefficient."""
+MARGIN_PX = 0.35
+"""Width of the rim that is left out, px, besides ``MARGIN_BLURS`` standard deviations of the blur."""
+EXPECTED_TURN = 0.1
+"""Standard deviation of a step of the affine map, as a part of it."""
 EXPECTED_BLUR_PX2 = 1.5
 """Standard deviation of a step of the blur's variance, px²."""
 LEAST_NOISE = 0.4
 """Least standard deviation of the noise, grey levels: the square root of LEAST_VARIANCE of the design fit."""
 GRAIN = 2.0
 """Variance of the mean of many neighbouring samples' noise, relative to independent noise. Samples share pixels."""
-LAST_STEP_SHARE, REJECTED_RADII = 0.3, 0.02
-"""As in :mod:`kpbench.fitting.covariance`: of the rest of the way, and of rejected samples, in short semi-axes."""
+REJECTED_RADII = 0.02
+"""Standard deviation of the centre, in short semi-axes, is this times the square of the rejected share of the
+weights."""
 COLUMNS = 14
 """Unknowns: grey, contrast, place (2), affine map (4), blur, tone, light along x and y, uneven blur (2)."""
 

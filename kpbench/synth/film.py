@@ -34,7 +34,7 @@ BAR_WIDTH, BAR_REACH = 0.4, 1.1
 
 
 @dataclass(frozen=True)
-class Film:
+class FilmPlan:
     """What all films of a suite share.
 
     Attributes
@@ -55,7 +55,7 @@ class Film:
     occluded: float
 
     @classmethod
-    def parse(cls, table: TomlTable) -> Film:
+    def parse(cls, table: TomlTable) -> FilmPlan:
         """Read the table ``film`` of a suite."""
         return cls(
             table.whole_number("frames", 2, 100_000),
@@ -147,7 +147,7 @@ def draw_path(
 
 
 def draw_bar(
-    rng: np.random.Generator, film: Film, frame: int, camera: Camera, board: BoardLike, pose: Pose
+    rng: np.random.Generator, film: FilmPlan, frame: int, camera: Camera, board: BoardLike, pose: Pose
 ) -> list[Effect]:
     """Return the record of the bar that passes before the board; an empty list in frames without it.
 
@@ -166,7 +166,7 @@ def draw_bar(
     return [{"effect": "occlusion", "strips": [[round(v, 3) for v in strip]]}]
 
 
-def film_record(film: Film, frame: int, pose: Pose) -> Effect:
+def film_record(film: FilmPlan, frame: int, pose: Pose) -> Effect:
     """Return the record of a frame: its number, its time, s, and the true pose at the middle of the exposure."""
     return {
         "effect": "film",

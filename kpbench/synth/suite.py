@@ -13,18 +13,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from kpbench.camera.preset import CameraPreset
 from kpbench.dataset.shard import Sample
-from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import BoardLike
 from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
-from kpbench.render.board_exposure import ExposedBoard
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
 from kpbench.seeds import (
@@ -42,55 +38,8 @@ from kpbench.synth.film import FILM_KEYS, draw_bar, draw_path, film_record
 from kpbench.synth.finish import degrade_scene, discs_of
 from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, suite_boards
 from kpbench.synth.suite_file import Condition, Suite
+from kpbench.synth.suite_view import View
 from kpbench.types import Float
-
-
-@dataclass(frozen=True)
-class View:
-    """Everything that one image of a suite shows, except the background, before anything is painted.
-
-    Attributes
-    ----------
-    condition : str
-    rung : float
-    scene_id : int
-        The base scene.
-    board : Board or TagBoard
-    pose : Pose
-    appearance : Appearance
-    effects : list of dict
-        Records of the effects, see :func:`kpbench.degrade.draw_effect`.
-    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
-        The truth before occlusion; ``contrast`` is nan.
-    camera : Camera
-        Lens and size of the image.
-    exposed : ExposedBoard or None
-        The board as the camera exposes it. None without a preset.
-    taken : dict or None
-        What the camera drew, see :meth:`kpbench.camera.CameraPreset.draw`. None without a preset.
-    frame : dict or None
-        Record of the frame, see :func:`kpbench.synth.film.film_record`. None if the suite has no films.
-
-    Examples
-    --------
-    >>> from kpbench import SuiteConfig, load_suite
-    >>> view = SuiteConfig(load_suite("paper-v1"), images=2).view(0)
-    >>> view.condition, view.rung, len(view.keypoints)
-    ('scale', 0.5, 6)
-    """
-
-    condition: str
-    rung: float
-    scene_id: int
-    board: BoardLike
-    pose: Pose
-    appearance: Appearance
-    effects: list[Effect]
-    keypoints: NDArray[Any]
-    camera: Camera
-    exposed: ExposedBoard | None = None
-    taken: Effect | None = None
-    frame: Effect | None = None
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from kpbench.files import find_shipped, shipped_files
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board_file import find_patch
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.synth.film import FILM_BOUNDS, FILM_KEYS, Film
+from kpbench.synth.film import FILM_BOUNDS, FILM_KEYS, FilmPlan
 from kpbench.toml import TomlTable, name_source, read_toml
 
 SUITE_SCHEMA = "kpbench.suite/1"
@@ -109,7 +109,7 @@ class Suite:
     conditions : tuple of Condition
     preset : CameraPreset or None
         The camera that takes the images, in linear light. None: a linear world, in which inks keep their levels.
-    film : Film or None
+    film : FilmPlan or None
         Every base scene is a film. None: every base scene is one image.
 
     Examples
@@ -129,7 +129,7 @@ class Suite:
     scene: tuple[tuple[str, tuple[float, float]], ...]
     conditions: tuple[Condition, ...]
     preset: CameraPreset | None = None
-    film: Film | None = None
+    film: FilmPlan | None = None
 
     def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
         """Return the camera of the suite, or a camera of another image size with the same horizontal field of view.
@@ -194,7 +194,7 @@ def _parse_suite(table: TomlTable) -> Suite:
     names = [c.name for c in conditions]
     if len(set(names)) < len(names):
         raise DataError(f"two conditions share a name, among: {', '.join(names)}")
-    film = Film.parse(table.table("film", ("frames", "fps", "exposure", "occluded"))) if "film" in table else None
+    film = FilmPlan.parse(table.table("film", ("frames", "fps", "exposure", "occluded"))) if "film" in table else None
     if any(bool(c.film) != (film is not None) for c in conditions):
         raise DataError("expected a table `film` in the suite and in every condition, or in none")
     has_preset = film is not None or any(key in camera for key in QUANTITIES) or any(c.camera for c in conditions)

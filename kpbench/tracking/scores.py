@@ -60,7 +60,7 @@ def score_poses(poses: str | Path, dataset: str | Path | Dataset) -> TrackScores
     Parameters
     ----------
     poses : str or Path
-        From ``kpbench track`` or ``kpbench detect --poses``. Of several poses of an image, the first counts.
+        From :func:`kpbench.boards.write_poses`. Of several poses of an image, the first counts.
     dataset : str, Path or Dataset
         From ``kpbench suite video-v1``.
 

@@ -34,13 +34,13 @@ LEAST_RADIUS_PX = 3.0
 """Short semi-axis of the smallest patch that is looked for in a window, px."""
 LEAST_NCC = 0.7
 """Least correlation of a fitted patch with its design. What is no patch seldom reaches 0.6."""
-LEAST_CONTRAST = 4.0
+LEAST_PATCH_CONTRAST = 4.0
 """Least contrast of a patch, white minus black, grey levels."""
 LARGEST_MOVE = 0.2
 """Largest distance of the fitted centre from the aligned one, in short semi-axes."""
 LEAST_SHARE = 0.5
 """Part of the patches that must agree with their designs before shifts of the whole board are left untried."""
-REACH, SHIFT_REACH = 0.6, 2.2
+WINDOW_REACH, SHIFT_REACH = 0.6, 2.2
 """Largest error of the prediction that windows hold, in long semi-axes: without and with shifts."""
 LARGEST_OFF = 36.0
 """Largest squared distance of a point from its projection, in standard deviations."""
@@ -213,11 +213,13 @@ class Tracker:
         radius = short_semi_axis(A)
         gap_px = self._gap_mm * float(np.median(np.sqrt(np.abs(np.linalg.det(A / self._radius_mm(points))))))
         largest = min(SHIFT_REACH, 0.45 * gap_px / float(radius.mean()))  # a longer shift would fit other patches
-        for reach, shift in ((REACH, 0.0), (REACH + largest, largest)):
+        for reach, shift in ((WINDOW_REACH, 0.0), (WINDOW_REACH + largest, largest)):
             search = WindowSearch(self._templates, self._design[points])
             windows = cut_windows(image, xy, A, self._extent[points], reach)
             fit, moved = search.find(windows, xy, A, self._blur_px[points], shift)
-            good = np.flatnonzero((fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.contrast > LEAST_CONTRAST))
+            good = np.flatnonzero(
+                (fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.contrast > LEAST_PATCH_CONTRAST)
+            )
             if len(good) < max(LEAST_POSE_POINTS, LEAST_SHARE * len(points)) and not shift:
                 continue
             ids = np.array([k.patch_id for k in self.board.keypoints])[points]
