@@ -67,7 +67,7 @@ class SampledFit:
 
 
 def fit_samples(
-    image: Float32, xy: Float, A: Float, patches: Sequence[Patch], blur_px: Float, steps: int = 2
+    image: Float32, xy: Float, A: Float, bend: Float, patches: Sequence[Patch], blur_px: Float, steps: int = 2
 ) -> SampledFit:
     """Fit designs to the pixels of an image.
 
@@ -76,6 +76,8 @@ def fit_samples(
     image : ndarray of shape (H, W), float32
     xy, A : ndarray of shape (N, 2) and (N, 2, 2)
         Starting poses, px, right to about a tenth of the radius.
+    bend : ndarray of shape (N, 2)
+        Perspective b, which stays: a point u of the patch frame is seen at ``xy + A u / (1 + b·u)``.
     patches : sequence of Patch
         N designs.
     blur_px : ndarray of shape (N,)
@@ -95,11 +97,13 @@ def fit_samples(
     >>> v, u = (np.mgrid[:64, :64] - 31.5) / 20.0
     >>> black = patch.is_black(np.stack([u, v], axis=-1))
     >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.float32)
-    >>> found = fit_samples(image, np.array([[31.9, 31.0]]), np.array([np.eye(2) * 20.0]), [patch], np.array([0.5]))
+    >>> start = np.array([[31.9, 31.0]]), np.array([np.eye(2) * 20.0]), np.zeros((1, 2))
+    >>> found = fit_samples(image, *start, [patch], np.array([0.5]))
     >>> found.xy.round(1)
     array([[31.5, 31.5]])
     """
     u, v = POINTS.T.astype(np.float32)
+    points = POINTS.T.astype(np.float32) / (1 + bend[:, None] @ POINTS.T).astype(np.float32)  # (N, 2, M)
     for _ in range(steps):
         minor = np.maximum(short_semi_axis(A), 0.5)
         inverse = np.linalg.inv(A)
@@ -110,7 +114,7 @@ def fit_samples(
         variance = (BLURS[level] ** 2 / per_px2).astype(np.float32)  # of the blur, px²
         uneven = np.stack([(spread[:, 0, 0] - spread[:, 1, 1]) / 2, spread[:, 0, 1]], axis=1) * variance[:, None]
         model = J[:, 1] + np.einsum("nk,nkm->nm", uneven.astype(np.float32), J[:, 12:])
-        grey = _sample(image, xy, A)
+        grey = _sample(image, xy, A, points)
         reach = np.maximum(1 - (MARGIN_PX + MARGIN_BLURS * blur_px) / minor, 0.5)
         inside = (reach[:, None] > _RADIUS).astype(np.float32)
         black_white, ncc, count = _regress(grey, model, inside)
@@ -152,11 +156,9 @@ def fit_samples(
     return SampledFit(xy, A, 2 * black_white[:, 1], blur_px, ncc, covariance)
 
 
-def _sample(image: Float32, xy: Float, A: Float) -> Float32:
-    """Return the grey levels (N, M) at the sample points of N patches."""
-    x, y = (
-        A[:, k].astype(np.float32) @ POINTS.T.astype(np.float32) + xy[:, k, None].astype(np.float32) for k in (0, 1)
-    )
+def _sample(image: Float32, xy: Float, A: Float, points: Float32) -> Float32:
+    """Return the grey levels (N, M) at points (N, 2, M) of the frames of N patches, before the affine maps."""
+    x, y = np.ascontiguousarray((A.astype(np.float32) @ points + xy[:, :, None].astype(np.float32)).transpose(1, 0, 2))
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32)
 
 

@@ -207,7 +207,7 @@ class Tracker:
 
     def _track(self, image: UInt8, camera: Camera, pose: BoardPose) -> tuple[BoardMatch, BoardPose] | None:
         """Look for the board in windows around its predicted patches."""
-        points, xy, A = self._predict(camera, pose)
+        points, xy, A, bend = self._predict(camera, pose)
         if len(points) < LEAST_POSE_POINTS:
             return None
         radius = short_semi_axis(A)
@@ -216,7 +216,7 @@ class Tracker:
         for reach, shift in ((WINDOW_REACH, 0.0), (WINDOW_REACH + largest, largest)):
             search = WindowSearch(self._templates, self._design[points])
             windows = cut_windows(image, xy, A, self._extent[points], reach)
-            fit, moved = search.find(windows, xy, A, self._blur_px[points], shift)
+            fit, moved = search.find(windows, xy, A, bend, self._blur_px[points], shift)
             good = np.flatnonzero(
                 (fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.contrast > LEAST_PATCH_CONTRAST)
             )
@@ -253,7 +253,7 @@ class Tracker:
             points, detections = points[kept], detections[kept]
         return None
 
-    def _predict(self, camera: Camera, pose: BoardPose) -> tuple[Int, Float, Float]:
+    def _predict(self, camera: Camera, pose: BoardPose) -> tuple[Int, Float, Float, Float]:
         """Return the points that lie wholly in the image and are large enough, and their predicted poses, px."""
         X = self.board.points_mm @ pose.rotation.T + pose.translation_mm
         points = np.flatnonzero(X[:, 2] > 1e-6)
@@ -268,7 +268,8 @@ class Tracker:
         reach = np.linalg.norm(A, axis=2) * self._extent[points, None]
         inside = ((xy - reach > 0) & (xy + reach < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
         inside &= (short_semi_axis(A) >= LEAST_RADIUS_PX) & (np.linalg.det(A) > 0)
-        return points[inside], xy[inside], A[inside]
+        bend = (R[2] @ self._to_board[points]) / X[points, 2:]
+        return points[inside], xy[inside], A[inside], bend[inside]
 
 
 def _turn_rad(pose: BoardPose, motion: PoseFilter) -> float:

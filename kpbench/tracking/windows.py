@@ -117,7 +117,7 @@ class WindowSearch:
         return [self.templates.patches[n] for n in self.design]
 
     def find(
-        self, windows: Windows, xy: Float, A: Float, blur_px: Float, largest_shift: float
+        self, windows: Windows, xy: Float, A: Float, bend: Float, blur_px: Float, largest_shift: float
     ) -> tuple[SampledFit, Float]:
         """Find patches near their predicted poses.
 
@@ -126,6 +126,8 @@ class WindowSearch:
         windows : Windows
         xy, A : ndarray of shape (N, 2) and (N, 2, 2)
             Predicted poses, px of the image.
+        bend : ndarray of shape (N, 2)
+            Their perspective, see :func:`kpbench.fitting.sampled_fit.fit_samples`.
         blur_px : ndarray of shape (N,)
             Standard deviations of the blur to start from, px of the image.
         largest_shift : float
@@ -147,7 +149,7 @@ class WindowSearch:
             xy = xy + self._find_shift(levels, xy, A, largest_shift) / windows.scale[:, None] * windows.scale.mean()
         poses = Poses(xy, A, self.design, np.zeros(len(xy)))
         poses = align_poses(levels, poses, self.templates.whole, 2, WHOLE_RADIUS_PX)
-        fit = fit_samples(windows.strip, poses.xy, poses.A, self.patches, blur_px / windows.scale)
+        fit = fit_samples(windows.strip, poses.xy, poses.A, bend, self.patches, blur_px / windows.scale)
         moved = np.linalg.norm(fit.xy - poses.xy, axis=1) / np.maximum(short_semi_axis(poses.A), 0.5)
         centres, maps = windows.to_image(fit.xy, fit.A)
         covariance = fit.covariance * windows.scale[:, None, None] ** 2
