@@ -103,7 +103,7 @@ def fit_samples(
     array([[31.5, 31.5]])
     """
     u, v = POINTS.T.astype(np.float32)
-    points = POINTS.T.astype(np.float32) / (1 + bend[:, None] @ POINTS.T).astype(np.float32)  # (N, 2, M)
+    points: Float32 = (POINTS.T / (1 + bend[:, None] @ POINTS.T)).astype(np.float32)  # (N, 2, M)
     for _ in range(steps):
         minor = np.maximum(short_semi_axis(A), 0.5)
         inverse = np.linalg.inv(A)

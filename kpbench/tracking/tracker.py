@@ -17,7 +17,7 @@ import numpy as np
 
 from kpbench.boards.frames import straighten
 from kpbench.boards.matching import BoardMatch, find_board
-from kpbench.boards.pose import LEAST_POSE_POINTS, BoardPose, estimate_pose, rotation_vector
+from kpbench.boards.pose import BoardPose, estimate_pose, rotation_vector
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.errors import DataError
 from kpbench.fitting.align import short_semi_axis
@@ -26,16 +26,13 @@ from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
 from kpbench.patches.symmetry import board_turns_deg
 from kpbench.tracking.motion_filter import PoseFilter
-from kpbench.tracking.windows import WindowSearch, cut_windows
+from kpbench.tracking.prediction import predict_patches
+from kpbench.tracking.windows import LEAST_NCC, LEAST_PATCH_CONTRAST, USUAL_BLUR_PX, WindowSearch, cut_windows
 from kpbench.types import Detections, Float, Int, UInt8
 
 State = Literal["seen", "tracked", "predicted", ""]
-LEAST_RADIUS_PX = 3.0
-"""Short semi-axis of the smallest patch that is looked for in a window, px."""
-LEAST_NCC = 0.7
-"""Least correlation of a fitted patch with its design. What is no patch seldom reaches 0.6."""
-LEAST_PATCH_CONTRAST = 4.0
-"""Least contrast of a patch, white minus black, grey levels."""
+LEAST_TRACKED = 4
+"""Smallest number of patches that make a tracked pose. With three, no error would show."""
 LARGEST_MOVE = 0.2
 """Largest distance of the fitted centre from the aligned one, in short semi-axes."""
 LEAST_SHARE = 0.5
@@ -46,8 +43,6 @@ LARGEST_OFF = 36.0
 """Largest squared distance of a point from its projection, in standard deviations."""
 OFF_FLOOR_PX = 0.15
 """Standard deviation that is added to every point's for this: what no fit knows, such as a bent board."""
-USUAL_BLUR_PX = 0.8
-"""Blur from which a first fit starts, px."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +119,6 @@ class Tracker:
         ids = [patch.patch_id for patch in board.patches]
         self._design = np.array([ids.index(k.patch_id) for k in board.keypoints], np.int64)
         self._templates = templates
-        self._to_board = np.stack([k.H_patch2board[:2, :2] for k in board.keypoints])
         self._extent = np.array([k.patch.extent for k in board.keypoints])
         gap = np.linalg.norm(board.points_mm[:, None] - board.points_mm, axis=2)
         self._gap_mm = float(gap[gap > 0].min(initial=np.inf))
@@ -200,6 +194,8 @@ class Tracker:
         match = matches[0]
         if not match.is_sure or (match.alternatives and not self._is_symmetric):
             return None, "the points are ambiguous"
+        if self._filter is None and len(match.points) < LEAST_TRACKED:
+            return None, f"{len(match.points)} points, expected at least {LEAST_TRACKED} to begin with"
         try:
             return (match, estimate_pose(match, camera)), ""
         except DataError as error:
@@ -207,20 +203,22 @@ class Tracker:
 
     def _track(self, image: UInt8, camera: Camera, pose: BoardPose) -> tuple[BoardMatch, BoardPose] | None:
         """Look for the board in windows around its predicted patches."""
-        points, xy, A, bend = self._predict(camera, pose)
-        if len(points) < LEAST_POSE_POINTS:
+        H = np.column_stack([pose.rotation[:, :2], pose.translation_mm])
+        predicted = predict_patches(H, self.board, camera, (camera.width_px, camera.height_px))
+        points, A = predicted.points, predicted.A
+        if len(points) < LEAST_TRACKED:
             return None
         radius = short_semi_axis(A)
         gap_px = self._gap_mm * float(np.median(np.sqrt(np.abs(np.linalg.det(A / self._radius_mm(points))))))
         largest = min(SHIFT_REACH, 0.45 * gap_px / float(radius.mean()))  # a longer shift would fit other patches
         for reach, shift in ((WINDOW_REACH, 0.0), (WINDOW_REACH + largest, largest)):
             search = WindowSearch(self._templates, self._design[points])
-            windows = cut_windows(image, xy, A, self._extent[points], reach)
-            fit, moved = search.find(windows, xy, A, bend, self._blur_px[points], shift)
+            windows = cut_windows(image, predicted.xy, A, self._extent[points], reach)
+            fit, moved = search.find(windows, predicted, self._blur_px[points], shift)
             good = np.flatnonzero(
                 (fit.ncc >= LEAST_NCC) & (moved <= LARGEST_MOVE) & (fit.contrast > LEAST_PATCH_CONTRAST)
             )
-            if len(good) < max(LEAST_POSE_POINTS, LEAST_SHARE * len(points)) and not shift:
+            if len(good) < max(LEAST_TRACKED, LEAST_SHARE * len(points)) and not shift:
                 continue
             ids = np.array([k.patch_id for k in self.board.keypoints])[points]
             detections = Detections(fit.xy, np.maximum(fit.ncc, 0), ids, fit.A, fit.covariance, fit.blur_px)
@@ -235,7 +233,7 @@ class Tracker:
 
     def _verify(self, points: Int, detections: Detections, camera: Camera) -> tuple[BoardMatch, BoardPose] | None:
         """Return the points that agree with one pose, and the pose."""
-        while len(points) >= LEAST_POSE_POINTS:
+        while len(points) >= LEAST_TRACKED:
             frames, agrees = straighten(detections, camera), np.ones(len(points), bool)
             index = np.arange(len(points))
             match = BoardMatch(self.board, index, points, detections, agrees, camera=camera, frames=frames)
@@ -252,24 +250,6 @@ class Tracker:
             kept = np.delete(index, int(squares.argmax()))
             points, detections = points[kept], detections[kept]
         return None
-
-    def _predict(self, camera: Camera, pose: BoardPose) -> tuple[Int, Float, Float, Float]:
-        """Return the points that lie wholly in the image and are large enough, and their predicted poses, px."""
-        X = self.board.points_mm @ pose.rotation.T + pose.translation_mm
-        points = np.flatnonzero(X[:, 2] > 1e-6)
-        rays = X[points, :2] / X[points, 2:]
-        valid = np.hypot(rays[:, 0], rays[:, 1]) < camera.lens.largest_radius
-        points, rays = points[valid], rays[valid]
-        xy = camera.distort(rays)
-        focal = camera.K[[0, 1], [0, 1]]
-        R = pose.rotation[:, :2]
-        to_ray = (R[:2] - rays[:, :, None] * R[2]) / X[points, 2][:, None, None]
-        A = focal[:, None] * camera.lens.jacobian(rays) @ to_ray @ self._to_board[points]
-        reach = np.linalg.norm(A, axis=2) * self._extent[points, None]
-        inside = ((xy - reach > 0) & (xy + reach < [camera.width_px - 1, camera.height_px - 1])).all(axis=1)
-        inside &= (short_semi_axis(A) >= LEAST_RADIUS_PX) & (np.linalg.det(A) > 0)
-        bend = (R[2] @ self._to_board[points]) / X[points, 2:]
-        return points[inside], xy[inside], A[inside], bend[inside]
 
 
 def _turn_rad(pose: BoardPose, motion: PoseFilter) -> float:

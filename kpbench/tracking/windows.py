@@ -19,12 +19,19 @@ from kpbench.fitting.sampled_fit import SampledFit, fit_samples
 from kpbench.fitting.templates import DesignTemplates
 from kpbench.images import to_grey
 from kpbench.patches.design import Patch
+from kpbench.tracking.prediction import PredictedPatches
 from kpbench.types import Float, Float32, Int, UInt8
 
 WINDOW_RADIUS_PX = 24.0
 """Largest long semi-axis of a patch, rim included, in its window, px of the window."""
 RIM = 1.4
 """Part of a window that the patch itself takes, in long semi-axes."""
+LEAST_NCC = 0.7
+"""Least correlation of a fitted patch with its design. What is no patch seldom reaches 0.6."""
+LEAST_PATCH_CONTRAST = 4.0
+"""Least contrast of a patch, white minus black, grey levels."""
+USUAL_BLUR_PX = 0.8
+"""Blur from which a first fit starts, px."""
 SHIFT_STEP = 0.35
 """Distance of the shifts that are tried, in short semi-axes. The alignment finds its way from half as far."""
 
@@ -117,17 +124,15 @@ class WindowSearch:
         return [self.templates.patches[n] for n in self.design]
 
     def find(
-        self, windows: Windows, xy: Float, A: Float, bend: Float, blur_px: Float, largest_shift: float
+        self, windows: Windows, predicted: PredictedPatches, blur_px: Float, largest_shift: float
     ) -> tuple[SampledFit, Float]:
         """Find patches near their predicted poses.
 
         Parameters
         ----------
         windows : Windows
-        xy, A : ndarray of shape (N, 2) and (N, 2, 2)
-            Predicted poses, px of the image.
-        bend : ndarray of shape (N, 2)
-            Their perspective, see :func:`kpbench.fitting.sampled_fit.fit_samples`.
+        predicted : PredictedPatches
+            N patches.
         blur_px : ndarray of shape (N,)
             Standard deviations of the blur to start from, px of the image.
         largest_shift : float
@@ -144,12 +149,12 @@ class WindowSearch:
         levels = [np.asarray(cv2.GaussianBlur(windows.strip, (0, 0), 0.7), np.float32)]
         while len(levels) < 3:
             levels.append(np.asarray(cv2.pyrDown(levels[-1]), np.float32))
-        xy, A = windows.to_strip(xy, A)
+        xy, A = windows.to_strip(predicted.xy, predicted.A)
         if largest_shift:
             xy = xy + self._find_shift(levels, xy, A, largest_shift) / windows.scale[:, None] * windows.scale.mean()
         poses = Poses(xy, A, self.design, np.zeros(len(xy)))
         poses = align_poses(levels, poses, self.templates.whole, 2, WHOLE_RADIUS_PX)
-        fit = fit_samples(windows.strip, poses.xy, poses.A, bend, self.patches, blur_px / windows.scale)
+        fit = fit_samples(windows.strip, poses.xy, poses.A, predicted.bend, self.patches, blur_px / windows.scale)
         moved = np.linalg.norm(fit.xy - poses.xy, axis=1) / np.maximum(short_semi_axis(poses.A), 0.5)
         centres, maps = windows.to_image(fit.xy, fit.A)
         covariance = fit.covariance * windows.scale[:, None, None] ** 2

@@ -95,7 +95,7 @@ def test_a_film_with_a_bad_end_is_tracked(films, tracked, tmp_path):
     write_camera(tmp_path / "camera.yaml", camera)
     lines = [f'[[keypoint]]\npatch = "{k.patch.name}"\nx_mm = {k.x_mm}\ny_mm = {k.y_mm}\n' for k in board.keypoints]
     (tmp_path / "board.toml").write_text(
-        f'schema = "kpbench.board/1"\nname = "mine"\nsize_mm = [{board.side_x_mm}, {board.side_y_mm}]\n'
+        f'schema = "kpbench.board-design/1"\nname = "mine"\nsize_mm = [{board.side_x_mm}, {board.side_y_mm}]\n'
         f"diameter_mm = {board.keypoints[0].diameter_mm}\n{''.join(lines)}"
     )
     done = kpbench(
