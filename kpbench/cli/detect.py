@@ -64,6 +64,11 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
     type=click.Path(dir_okay=False, path_type=Path),
     help="File of poses to write (.csv, .jsonl): a line per image and board. Needs --board and --camera.",
 )
+@click.option(
+    "--second-look",
+    is_flag=True,
+    help="Look for patches that the detector missed, where their board says that they must be. Runs in one process.",
+)
 @PATCHES
 @WORKERS
 def detect(
@@ -75,6 +80,7 @@ def detect(
     board_names: tuple[str, ...],
     camera: Path | None,
     poses: Path | None,
+    second_look: bool,
     patches: tuple[Path, ...],
     workers: int | None,
 ) -> None:
@@ -94,6 +100,7 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
       kpbench detect camera:0 --detector superpoint-small --out -
       kpbench detect film.mp4 --board patches-print/grid.json --camera camera.yaml --poses poses.csv
+      kpbench detect photos --board patches-print/grid.json --second-look
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.detectors.interface import load_detector
@@ -105,8 +112,8 @@ def detect(
 
     if patches and detector != "template":
         raise click.UsageError(f"--patches is for the template detector; {detector} does not take designs")
-    if (not board_names and (camera or poses)) or (poses and not camera):
-        raise click.UsageError("--poses needs --board and --camera, and --camera needs --board")
+    if (not board_names and (camera or poses or second_look)) or (poses and not camera):
+        raise click.UsageError("--poses needs --board and --camera; --camera and --second-look need --board")
     is_streamed = str(out) == "-"
     if not is_streamed:
         require_predictions_path(out)
@@ -118,7 +125,11 @@ def detect(
             f"{sources[0]} holds other designs than {detector} looks for; use template with `patches`, "
             "or weights trained on the other designs"
         )
-    loaded = load_detector(detector, threshold, designs) if designs else detector
+    loaded = load_detector(detector, threshold, designs) if designs or second_look else detector
+    if second_look:
+        from kpbench.tracking.second_look import look_twice
+
+        loaded = look_twice(loaded, finder.boards, finder.camera)  # type: ignore[arg-type]
     try:
         with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
             options: dict[str, Any] = {
