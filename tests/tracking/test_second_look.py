@@ -1,7 +1,7 @@
 """The second look finds what was missed, and nothing that is not there."""
 
 import numpy as np
-from test_tracker import BOARD, CAMERA, detector, pose_at, shot
+from track_scenes import BOARD, CAMERA, detector, pose_at, shot
 
 import kpbench
 from kpbench.detectors import LoadedDetector
