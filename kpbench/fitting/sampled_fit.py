@@ -151,6 +151,7 @@ def fit_samples(
     rejected = (1 - weight.sum(axis=1) / np.maximum(count, 1)) ** 2 * REJECTED_RADII * minor
     even = LAST_STEP_SHARE**2 * (moved**2).sum(axis=1) + rejected**2
     covariance = noise + even[:, None, None] * np.eye(2)
+    covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
     unsure = black_white[:, 1] <= 1
     covariance[unsure] = start_covariance(A[unsure])
     return SampledFit(xy, A, 2 * black_white[:, 1], blur_px, ncc, covariance)
