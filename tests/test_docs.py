@@ -118,7 +118,7 @@ def stand_in_for_ros(monkeypatch):
         return SimpleNamespace(header=header, pose=SimpleNamespace(pose=nested))
 
     def spin(node):
-        image = kpbench.open_dataset("film").image(8)
+        image = kpbench.open_dataset("film").image(9)
         header = SimpleNamespace(stamp=SimpleNamespace(sec=7, nanosec=500_000_000))
         height, width = image.shape
         node.callback(SimpleNamespace(data=image.tobytes(), height=height, width=width, step=width, header=header))
