@@ -14,6 +14,7 @@ from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 if TYPE_CHECKING:
     from kpbench.boards.images import PoseRecord
+    from kpbench.detectors.interface import LoadedDetector
     from kpbench.detectors.prediction import Sink
     from kpbench.patches.design import Patch
     from kpbench.types import Predictions
@@ -126,10 +127,7 @@ def detect(
             "or weights trained on the other designs"
         )
     loaded = load_detector(detector, threshold, designs) if designs or second_look else detector
-    if second_look:
-        from kpbench.tracking.second_look import look_twice
-
-        loaded = look_twice(loaded, finder.boards, finder.camera)  # type: ignore[arg-type]
+    loaded = finder.look_twice(loaded) if second_look else loaded
     try:
         with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
             options: dict[str, Any] = {
@@ -149,11 +147,15 @@ def detect(
     echo(f"{name}: {len(run.predictions.xy)} detections in {len(run.predictions)} images", err=is_streamed)
     if run.failures:
         pairs = [f"{label}: {problem}" for label, problem in run.failures]
-        lines = images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs
-        for line in lines[:5]:
-            print_warning(line)
-        print_warning(f"{len(run.failures)} images failed and count as images without detections")
-        raise SystemExit(1)
+        _fail(images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs, len(run.failures))
+
+
+def _fail(lines: Sequence[str], count: int) -> None:
+    """Print the first lines about images that failed, and exit."""
+    for line in lines[:5]:
+        print_warning(line)
+    print_warning(f"{count} images failed and count as images without detections")
+    raise SystemExit(1)
 
 
 class BoardFinder:
@@ -170,6 +172,14 @@ class BoardFinder:
         self.boards = [board for name in names for board in load_boards(name, patches)]
         self.camera = None if camera is None else read_camera(camera)
         self.records: list[PoseRecord] = []
+
+    def look_twice(self, detector: str | LoadedDetector) -> LoadedDetector:
+        """Return a detector that also finds the patches that it missed on the boards."""
+        from kpbench.detectors.interface import load_detector
+        from kpbench.tracking.second_look import look_twice
+
+        loaded = load_detector(detector) if isinstance(detector, str) else detector
+        return look_twice(loaded, self.boards, self.camera)
 
     def locate(self, predictions: Predictions) -> Predictions:
         """Return predictions with the points of the boards."""

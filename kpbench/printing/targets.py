@@ -16,7 +16,7 @@ from kpbench.writing import require_writable, write_file
 
 TARGET_FOLDER = "targets"
 """Subfolder of the prints that holds the files for other programs."""
-SAME_MM = 1e-6
+MOST_UNEVEN_MM = 1e-6
 """Two coordinates of a grid that differ by less are the same."""
 
 
@@ -37,7 +37,7 @@ def _to_kalibr(board: Board) -> str:
     x, y = (_grid_lines(board, axis) for axis in (0, 1))
     pitches = np.concatenate([np.diff(x), np.diff(y)])
     is_grid = len(x) > 1 and len(y) > 1 and len(x) * len(y) == len(board.keypoints)
-    if not is_grid or np.ptp(pitches) > SAME_MM:
+    if not is_grid or np.ptp(pitches) > MOST_UNEVEN_MM:
         raise DesignError(f"board {board.name!r}: is no grid of one pitch, the only board that Kalibr can describe")
     return (
         "# kpbench.target/1\n"

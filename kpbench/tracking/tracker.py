@@ -98,11 +98,11 @@ class Tracker:
     ...     pose = Pose(np.eye(3), np.array([2.0 * n, 0.0, 250.0]))
     ...     frame = render_board(np.full((240, 320), 90, np.uint8), camera, pose, board, Appearance(30, 220)).image
     ...     tracked = tracker(frame, time_s=n / 30)
-    ...     print(tracked.state, tracked.pose.translation_mm.round().tolist())
-    seen [0.0, 0.0, 250.0]
-    seen [2.0, 0.0, 250.0]
-    tracked [4.0, 0.0, 250.0]
-    tracked [6.0, 0.0, 250.0]
+    ...     print(tracked.state, round(tracked.pose.translation_mm[0]))
+    seen 0
+    seen 2
+    tracked 4
+    tracked 6
     """
 
     def __init__(
