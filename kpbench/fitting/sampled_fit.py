@@ -22,7 +22,7 @@ from kpbench.fitting.templates import draw_ink, look_up_ink
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
 
-GRID = 28
+GRID = 24
 """Sample points per diameter of a disc."""
 BLURS = 0.03 * 1.2 ** np.arange(17)
 """Blurs for which derivatives are computed, in disc radii."""

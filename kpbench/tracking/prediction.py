@@ -54,9 +54,8 @@ def predict_patches(H: Float, board: Board, camera: Camera | None, size_px: tupl
     size_px : (int, int)
         Width and height of the image.
     """
-    keypoints = board.keypoints
-    to_board = np.stack([k.H_patch2board[:2, :2] for k in keypoints])
-    extent = np.array([k.patch.extent for k in keypoints])
+    to_board = board.A_patch2board
+    extent = np.array([k.patch.extent for k in board.keypoints])
     seen = board.points_mm[:, :2] @ H[:, :2].T + H[:, 2]
     points = np.flatnonzero(seen[:, 2] > 1e-9)
     w = seen[points, 2:]

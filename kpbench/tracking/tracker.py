@@ -28,7 +28,7 @@ from kpbench.patches.symmetry import board_turns_deg
 from kpbench.tracking.motion_filter import PoseFilter
 from kpbench.tracking.prediction import predict_patches
 from kpbench.tracking.windows import LEAST_NCC, LEAST_PATCH_CONTRAST, USUAL_BLUR_PX, WindowSearch, cut_windows
-from kpbench.types import Detections, Float, Int, UInt8
+from kpbench.types import Detections, Int, UInt8
 
 State = Literal["seen", "tracked", "predicted", ""]
 LEAST_TRACKED = 4
@@ -119,6 +119,8 @@ class Tracker:
         ids = [patch.patch_id for patch in board.patches]
         self._design = np.array([ids.index(k.patch_id) for k in board.keypoints], np.int64)
         self._templates = templates
+        self._ids = np.array([k.patch_id for k in board.keypoints])
+        self._radius_mm = np.array([k.diameter_mm for k in board.keypoints]) / 2
         self._extent = np.array([k.patch.extent for k in board.keypoints])
         gap = np.linalg.norm(board.points_mm[:, None] - board.points_mm, axis=2)
         self._gap_mm = float(gap[gap > 0].min(initial=np.inf))
@@ -209,7 +211,9 @@ class Tracker:
         if len(points) < LEAST_TRACKED:
             return None
         radius = short_semi_axis(A)
-        gap_px = self._gap_mm * float(np.median(np.sqrt(np.abs(np.linalg.det(A / self._radius_mm(points))))))
+        gap_px = self._gap_mm * float(
+            np.median(np.sqrt(np.abs(np.linalg.det(A / self._radius_mm[points, None, None]))))
+        )
         largest = min(SHIFT_REACH, 0.45 * gap_px / float(radius.mean()))  # a longer shift would fit other patches
         for reach, shift in ((WINDOW_REACH, 0.0), (WINDOW_REACH + largest, largest)):
             search = WindowSearch(self._templates, self._design[points])
@@ -220,16 +224,13 @@ class Tracker:
             )
             if len(good) < max(LEAST_TRACKED, LEAST_SHARE * len(points)) and not shift:
                 continue
-            ids = np.array([k.patch_id for k in self.board.keypoints])[points]
-            detections = Detections(fit.xy, np.maximum(fit.ncc, 0), ids, fit.A, fit.covariance, fit.blur_px)
+            detections = Detections(
+                fit.xy, np.maximum(fit.ncc, 0), self._ids[points], fit.A, fit.covariance, fit.blur_px
+            )
             found = self._verify(points[good], detections[good], camera)
             if found is not None:
                 return found
         return None
-
-    def _radius_mm(self, points: Int) -> Float:
-        diameter_mm = np.array([k.diameter_mm for k in self.board.keypoints])
-        return diameter_mm[points, None, None] / 2
 
     def _verify(self, points: Int, detections: Detections, camera: Camera) -> tuple[BoardMatch, BoardPose] | None:
         """Return the points that agree with one pose, and the pose."""
