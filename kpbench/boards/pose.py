@@ -14,6 +14,8 @@ from kpbench.types import Float
 
 LEAST_POSE_POINTS = 3
 """Smallest number of points that determine the pose of a plane, together with the frames of their patches."""
+LEAST_CHECKED = 4
+"""Smallest number of points whose errors tell a wrong pose. With fewer points, a pose is always ambiguous."""
 LEAST_ASIDE = 0.02
 """Smallest extent of the points across their main direction, relative to the extent along it."""
 LEAST_SIGMA_PX = 0.05
@@ -132,7 +134,8 @@ def estimate_pose(match: BoardMatch, camera: Camera) -> BoardPose:
     first = _solve(match, camera)
     others = [other for other in match.alternatives if other.board is match.board]
     rest = [_solve(other, camera)[0] for other in others[:1]] or first[1:]
-    return replace(first[0], ambiguous=bool(rest) or match.ambiguous, second=rest[0] if rest else None)
+    is_ambiguous = bool(rest) or match.ambiguous or len(match.points) < LEAST_CHECKED
+    return replace(first[0], ambiguous=is_ambiguous, second=rest[0] if rest else None)
 
 
 def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
