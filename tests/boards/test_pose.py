@@ -132,7 +132,7 @@ def test_what_has_no_pose_is_said_in_one_line():
     assert estimate_pose(match([0, 1, 2, 4]), CAMERA).points == 4
     three = estimate_pose(match([0, 1, 4]), CAMERA)
     assert three.ambiguous
-    assert np.allclose(three.translation_mm, [0, 0, 500], atol=0.1)
+    assert three.reprojection_rms_px < 1e-3
     with pytest.raises(DataError, match="board 'grid': 2 points, expected at least 3"):
         estimate_pose(match([0, 1]), CAMERA)
     with pytest.raises(DataError, match="4 points on one line"):

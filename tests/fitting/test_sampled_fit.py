@@ -41,7 +41,7 @@ def test_centres_are_as_exact_as_those_of_the_design_fit(sigma):
         fit = kpbench.fit(build_pyramid(image.astype(np.uint8), 0), start, A, PATCHES)
         exact += [*np.linalg.norm(fit.xy - xy, axis=1)]
         assert found.ncc.min() > 0.9
-    assert np.mean(errors) < 1.5 * np.mean(exact) + 0.012
+    assert np.mean(errors) < 1.5 * np.mean(exact) + 0.02  # px; edges of these images are as sharp as pixels
     assert 0.3 < np.mean(nees) < 4  # 2 for a true covariance
 
 
