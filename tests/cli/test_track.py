@@ -115,6 +115,8 @@ def test_what_cannot_be_tracked_is_one_line(films, tmp_path):
     assert "--board is missing" in kpbench("track", data.path, code=2).stderr
     other = kpbench("track", data.path, "--board", "grid", code=2)
     assert "--camera is missing" in other.stderr
+    several = kpbench("track", films, "--board", "hexagon", code=2)
+    assert "--board hexagon names 4 boards; give the sidecar of one of them" in several.stderr
     assert (
         "expected .csv or .jsonl" in kpbench("track", films, "--poses", tmp_path / "poses.txt", code=1).stderr or True
     )
