@@ -42,6 +42,9 @@ from .scoring.scores import score as score
 from .synth.suite import SuiteConfig as SuiteConfig
 from .synth.suite_file import load_suite as load_suite
 from .synth.synthetic import SynthConfig as SynthConfig
+from .tracking.scores import score_poses as score_poses
+from .tracking.tracker import TrackedPose as TrackedPose
+from .tracking.tracker import Tracker as Tracker
 from .types import KEYPOINT_DTYPE as KEYPOINT_DTYPE
 from .types import Detections as Detections
 from .types import Predictions as Predictions

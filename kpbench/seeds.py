@@ -15,6 +15,10 @@ fields of the effects noise and low light."""
 SUITE_CAMERA, SUITE_SENSOR = 20, 21
 """The same: what a camera draws for a base scene, and the noise of its sensor."""
 
+SUITE_FILM = 22
+"""The same: path of the board, and the bar before it, of a film. Frame k of scene n of films of N frames takes the
+noise of its sensor from SUITE_SENSOR of n·N + k."""
+
 
 def stream(seed: int, index: int, stage: int) -> np.random.Generator:
     """Return the random numbers of one stage of one image.

@@ -66,6 +66,7 @@ ROOMS = {
     "report": ["scoring"],
     "fitting": ["geometry", "patches"],
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
+    "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],
     "training": [
         "geometry",
         "camera",

@@ -19,6 +19,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 
 import cv2
 import numpy as np
@@ -82,6 +83,8 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, example_data):
             noise = np.random.default_rng(n).integers(0, 256, (120, 160, 3), dtype=np.uint8)
             cv2.imwrite(f"photos/{n}.png", noise)
     code = "\n".join(code for _, code in blocks)
+    if "rclpy" in code:
+        stand_in_for_ros(monkeypatch)
     if "kpbench-data" in code and not re.search(r"kpbench synth --n \d+(?!.*--out)", code):
         shutil.copytree(example_data / "kpbench-data", tmp_path / "kpbench-data")
     for kind, code in blocks:
@@ -94,6 +97,46 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, example_data):
             Path(name[1]).write_text(code)
         else:
             run_shell(re.sub(r"--n \d{3,}", "--n 6", code))  # big numbers of images are made small
+
+
+def stand_in_for_ros(monkeypatch):
+    """Modules of ROS 2 that give a node one image of the folder ``film``, and take the pose that it publishes."""
+    published = []
+
+    class Node:
+        def __init__(self, name):
+            self.name = name
+
+        def create_publisher(self, kind, topic, depth):
+            return SimpleNamespace(publish=published.append)
+
+        def create_subscription(self, kind, topic, callback, qos):
+            self.callback = callback
+
+    def pose_message(header):
+        nested = SimpleNamespace(position=SimpleNamespace(), orientation=SimpleNamespace())
+        return SimpleNamespace(header=header, pose=SimpleNamespace(pose=nested))
+
+    def spin(node):
+        image = kpbench.open_dataset("film").image(9)
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=7, nanosec=500_000_000))
+        height, width = image.shape
+        node.callback(SimpleNamespace(data=image.tobytes(), height=height, width=width, step=width, header=header))
+        assert published[0].header is header
+        assert len(published[0].pose.covariance) == 36
+        assert 0.1 < published[0].pose.pose.position.z < 2  # m
+
+    parts = {
+        "rclpy": {"init": lambda: None, "spin": spin},
+        "rclpy.node": {"Node": Node},
+        "rclpy.qos": {"qos_profile_sensor_data": None},
+        "geometry_msgs.msg": {"PoseWithCovarianceStamped": pose_message},
+        "sensor_msgs.msg": {"Image": None},
+    }
+    for name in ("geometry_msgs", "sensor_msgs", *parts):
+        module = ModuleType(name)
+        vars(module).update(parts.get(name, {}))
+        monkeypatch.setitem(sys.modules, name, module)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_id)

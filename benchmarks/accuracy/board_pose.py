@@ -95,7 +95,7 @@ def judge(tally: Tally, found: Detections, true: np.ndarray, board: Board, camer
     start = time.process_time()
     matches = kpbench.find_board(found, board, camera)
     pose = None
-    if matches and len(matches[0].points) >= 4:
+    if matches:
         try:
             pose = kpbench.estimate_pose(matches[0], camera)
         except kpbench.KpbenchError:

@@ -35,6 +35,10 @@ class PoseRecord:
         None if there is no pose.
     reason : str
         Why there is no pose; "" if there is one.
+    state : {"seen", "tracked", "predicted", ""}
+        ``seen`` for a pose from detections. The others come from a tracker, see :class:`kpbench.tracking.TrackedPose`.
+    filtered : BoardPose or None
+        The pose that the filter of a tracker makes of this and of earlier images.
 
     Examples
     --------
@@ -50,6 +54,8 @@ class PoseRecord:
     board: str
     pose: BoardPose | None
     reason: str
+    state: str = "seen"
+    filtered: BoardPose | None = None
 
 
 def find_boards(

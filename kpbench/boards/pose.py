@@ -12,8 +12,10 @@ from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.types import Float
 
-LEAST_POSE_POINTS = 4
-"""Smallest number of points that determine the pose of a plane."""
+LEAST_POSE_POINTS = 3
+"""Smallest number of points that determine the pose of a plane, together with the frames of their patches."""
+LEAST_CHECKED = 4
+"""Smallest number of points whose errors tell a wrong pose. With fewer points, a pose is always ambiguous."""
 LEAST_ASIDE = 0.02
 """Smallest extent of the points across their main direction, relative to the extent along it."""
 LEAST_SIGMA_PX = 0.05
@@ -132,7 +134,8 @@ def estimate_pose(match: BoardMatch, camera: Camera) -> BoardPose:
     first = _solve(match, camera)
     others = [other for other in match.alternatives if other.board is match.board]
     rest = [_solve(other, camera)[0] for other in others[:1]] or first[1:]
-    return replace(first[0], ambiguous=bool(rest) or match.ambiguous, second=rest[0] if rest else None)
+    is_ambiguous = bool(rest) or match.ambiguous or len(match.points) < LEAST_CHECKED
+    return replace(first[0], ambiguous=is_ambiguous, second=rest[0] if rest else None)
 
 
 def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
@@ -148,17 +151,14 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
         frames = straighten(match.detections, camera)
     if not np.isfinite(frames.xy).all():
         raise DataError(f"{name}: the camera's lens shows no such points")
-    points, _, to_patch = match.board.orientations
-    J = frames.A @ to_patch[np.searchsorted(points, match.points)]
-    scale, shape = np.array([frame_errors(match.board.keypoints[n].patch) for n in match.points]).T
-    shape = np.where(match.agrees, shape, WRONG_FRAME)
-    unit_mm = float(np.mean([k.diameter_mm for k in match.board.keypoints])) / 2
-    H = fit_homography(X[:, :2] / unit_mm, frames.xy, J * unit_mm, scale, shape) @ np.diag([1, 1, unit_mm])
+    H = fit_board(match, frames)
     R, t = _initial_poses(H, np.append(X[:, :2].mean(axis=0), 1.0))
     R, t, information, cost = _refine(R, t, X, frames.xy, _whitening(frames, camera))
     valid = np.isfinite(cost) & ((X @ R[:, 2, :, None])[..., 0] + t[:, 2:] > 0).all(axis=1)
     if not valid.any():
         raise DataError(f"{name}: no pose fits the {len(X)} points")
+    if len(X) == 3:  # three points fit both poses exactly; the frames may tell
+        cost = cost + _frame_costs(R, t, match, frames)
     scale = _scale(float(cost[valid].min()), len(X), frames.covariance is not None)
     poses, costs = list[BoardPose](), list[float]()
     for k in np.argsort(np.where(valid, cost, np.inf))[: valid.sum()].tolist():
@@ -170,6 +170,22 @@ def _solve(match: BoardMatch, camera: Camera) -> list[BoardPose]:
     if len(poses) == 2 and (costs[1] - costs[0] > EXCLUDED_POSE * scale or _are_same(*poses)):
         poses.pop()
     return poses
+
+
+def fit_board(match: BoardMatch, frames: Frames) -> Float:
+    """Return the homography (3, 3) from (x, y, 1) of the board frame, mm, to the straight coordinates of a match."""
+    X, J, scale, shape, unit_mm = _board_frames(match, frames)
+    return fit_homography(X, frames.xy, J, scale, shape) @ np.diag([1, 1, unit_mm])
+
+
+def _board_frames(match: BoardMatch, frames: Frames) -> tuple[Float, Float, Float, Float, float]:
+    """Return points (n, 2) in mean disc radii, derivatives by them, their two errors, and the mean radius in mm."""
+    points, _, to_patch = match.board.orientations
+    J = frames.A @ to_patch[np.searchsorted(points, match.points)]
+    scale, shape = np.array([frame_errors(match.board.keypoints[n].patch) for n in match.points]).T
+    shape = np.where(match.agrees, shape, WRONG_FRAME)
+    unit_mm = float(np.mean([k.diameter_mm for k in match.board.keypoints])) / 2
+    return match.board.points_mm[match.points, :2] / unit_mm, J * unit_mm, scale, shape, unit_mm
 
 
 def _initial_poses(H: Float, middle: Float) -> tuple[Float, Float]:
@@ -197,6 +213,18 @@ def _initial_poses(H: Float, middle: Float) -> tuple[Float, Float]:
         R[k] = Rv @ np.array([[a, b, c * f - d * e], [c, d, b * e - a * f], [e, f, a * d - b * c]])
         t[k] = np.append(v, 1.0) / inverse_z - R[k][:, :2] @ middle[:2]
     return R, t
+
+
+def _frame_costs(R: Float, t: Float, match: BoardMatch, frames: Frames) -> Float:
+    """Return the sums (K,) of the squared errors of the frames under K poses, in their standard deviations."""
+    X, J, scale, shape, unit_mm = _board_frames(match, frames)
+    seen = (X * unit_mm) @ R[:, :, :2].transpose(0, 2, 1) + t[:, None]
+    ray = seen[..., :2] / seen[..., 2:]
+    expected = (R[:, None, :2, :2] - ray[..., None] * R[:, None, 2:, :2]) * (unit_mm / seen[..., 2:, None])
+    frame = np.linalg.solve(expected, np.broadcast_to(J, expected.shape))
+    size = np.sqrt(np.maximum(np.linalg.det(frame), 1e-12))
+    bent = ((frame / size[..., None, None] - np.eye(2)) ** 2).sum(axis=(2, 3))
+    return np.asarray((bent / shape**2 + (np.log(size) / scale) ** 2).sum(axis=1))
 
 
 def _whitening(frames: Frames, camera: Camera) -> Float:
@@ -229,7 +257,7 @@ def _refine(R: Float, t: Float, X: Float, rays: Float, whiten: Float) -> tuple[F
         information = transposed @ J
         damped = information * (1 + damping[:, None, None] * np.eye(6))
         step = np.asarray(np.linalg.solve(damped, transposed @ error.reshape(len(R), -1, 1))[..., 0], np.float64)
-        R_new, t_new = _exp(step[:, :3]) @ R, t + step[:, 3:]
+        R_new, t_new = exp_rotation(step[:, :3]) @ R, t + step[:, 3:]
         error_new, points_new = errors(R_new, t_new)
         cost_new = cost_of(error_new)
         better = cost_new <= cost
@@ -257,7 +285,7 @@ def _jacobian(points: Float, whiten: Float) -> Float:
     return np.asarray(whiten @ J).reshape(len(points), -1, 6)
 
 
-def _exp(rotation_vector: Float) -> Float:
+def exp_rotation(rotation_vector: Float) -> Float:
     """Return rotation matrices (K, 3, 3) of rotation vectors (K, 3), by Rodrigues' formula."""
     angle = np.sqrt((rotation_vector**2).sum(axis=1))
     x, y, z = (rotation_vector / np.maximum(angle, 1e-300)[:, None]).T
@@ -300,4 +328,6 @@ def _are_same(first: BoardPose, second: BoardPose) -> bool:
 def _scale(cost: float, n: int, has_covariance: bool) -> float:
     """Return the factor of the covariances that explains the residuals."""
     freedom = 2 * n - 6
+    if not freedom:
+        return 1.0 if has_covariance else LEAST_SIGMA_PX**2
     return max(1.0, cost / freedom) if has_covariance else max(LEAST_SIGMA_PX**2, cost / freedom)

@@ -5,14 +5,16 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kpbench.boards.images import PoseRecord
 from kpbench.boards.pose import BoardPose
-from kpbench.errors import DataError
-from kpbench.files import encode_utf8
+from kpbench.errors import DataError, PredictionsError, system_reason
+from kpbench.files import encode_utf8, read_bytes
 from kpbench.text import escape_csv
 from kpbench.writing import require_writable, write_file
 
@@ -23,13 +25,15 @@ POSE_SUFFIXES = (".csv", ".jsonl")
 MATRIX_COLUMNS = [f"rotation_{i}{j}" for i in "123" for j in "123"]
 COVARIANCE_COLUMNS = [f"covariance_{i}{j}" for i in "123456" for j in "123456" if j >= i]
 MOTION_KEYS = ("rotation", "quaternion_xyzw", "translation_mm")
-OTHER_KEYS = ("covariance", "reprojection_rms_px", "points", "ambiguous", "second", "state")
+OTHER_KEYS = ("covariance", "reprojection_rms_px", "points", "ambiguous", "second", "state", "filtered")
+MOTION_COLUMNS = ("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm")
 POSE_COLUMNS = (
     *("image_id", "file", "frame_index", "time_s", "board", *MATRIX_COLUMNS),
-    *("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm", *COVARIANCE_COLUMNS),
+    *(*MOTION_COLUMNS, *COVARIANCE_COLUMNS),
     *("reprojection_rms_px", "points", "ambiguous"),
-    *("second_qx", "second_qy", "second_qz", "second_qw", "second_tx_mm", "second_ty_mm", "second_tz_mm"),
+    *(f"second_{name}" for name in MOTION_COLUMNS),
     *("state", "reason"),
+    *(f"filtered_{name}" for name in (*MOTION_COLUMNS, *COVARIANCE_COLUMNS)),
 )
 """Columns of a CSV file. A covariance is symmetric: its upper triangle is listed."""
 
@@ -77,6 +81,91 @@ def write_poses(path: str | Path, records: Sequence[PoseRecord]) -> None:
         write_file(path, "\n".join(lines).encode())
 
 
+def holds_poses(path: str | Path) -> bool:
+    """Return whether a file begins as a file of poses does."""
+    try:
+        with Path(path).open("rb") as file:
+            return POSES_SCHEMA.encode() in file.read(64)
+    except OSError:
+        return False
+
+
+def read_poses(path: str | Path) -> list[dict[str, Any]]:
+    """Read a file of poses.
+
+    Returns
+    -------
+    list of dict
+        Per line: ``image_id``; ``rotation`` (3 x 3) and ``translation_mm``, or None for no pose; and ``filtered``, None
+        or a dict with the same two.
+
+    Raises
+    ------
+    PredictionsError
+        If the file cannot be read, or a line is no pose. The message names the line.
+
+    Examples
+    --------
+    >>> from kpbench.boards import PoseRecord, read_poses, write_poses
+    >>> write_poses("poses.csv", [PoseRecord(0, "a.png", None, None, "grid", None, "the board was not found")])
+    >>> read_poses("poses.csv")
+    [{'image_id': 0, 'rotation': None, 'translation_mm': None, 'filtered': None}]
+    """
+    path = Path(path)
+    try:
+        lines = read_bytes(path).decode("utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PredictionsError(f"{path}: cannot be read, {system_reason(error) or 'it is no text'}") from None
+    if not lines or POSES_SCHEMA not in lines[0]:
+        raise PredictionsError(f"{path}: line 1: expected the schema {POSES_SCHEMA!r}")
+    is_csv = path.suffix.lower() == ".csv"
+    rows: Iterable[Any] = csv.DictReader(lines[1:]) if is_csv else filter(str.strip, lines[1:])
+    found = list[dict[str, Any]]()
+    parse: Callable[[Any], dict[str, Any]] = _parse_csv if is_csv else _parse_json
+    for n, row in enumerate(rows, start=3 if is_csv else 2):
+        try:
+            found.append(parse(row))
+        except (ValueError, KeyError, TypeError):
+            raise PredictionsError(f"{path}: line {n}: expected a pose as kpbench writes it") from None
+    return found
+
+
+def _parse_json(line: str) -> dict[str, Any]:
+    content = json.loads(line)
+    filtered = content["filtered"]
+    return {"image_id": int(content["image_id"]), **_checked(content), "filtered": filtered and _checked(filtered)}
+
+
+def _checked(content: dict[str, Any]) -> dict[str, Any]:
+    if content["rotation"] is None:
+        return {"rotation": None, "translation_mm": None}
+    rotation, place = (np.array(content[name], np.float64) for name in ("rotation", "translation_mm"))
+    if (
+        rotation.shape != (3, 3)
+        or place.shape != (3,)
+        or not (np.isfinite(rotation).all() and np.isfinite(place).all())
+    ):
+        raise ValueError
+    return {"rotation": rotation.tolist(), "translation_mm": place.tolist()}
+
+
+def _parse_csv(row: dict[str, str]) -> dict[str, Any]:
+    def motion(prefix: str) -> dict[str, Any]:
+        values = [row[f"{prefix}{name}"] for name in MOTION_COLUMNS]
+        if not values[0]:
+            return {"rotation": None, "translation_mm": None}
+        x, y, z, w, *place = map(float, values)
+        rotation = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+        return _checked({"rotation": rotation, "translation_mm": place})
+
+    filtered = motion("filtered_")
+    return {"image_id": int(row["image_id"]), **motion(""), "filtered": filtered if filtered["rotation"] else None}
+
+
 def _to_dict(record: PoseRecord) -> dict[str, Any]:
     pose = record.pose
     content: dict[str, Any] = {
@@ -95,8 +184,11 @@ def _to_dict(record: PoseRecord) -> dict[str, Any]:
             "points": pose.points,
             "ambiguous": pose.ambiguous,
             "second": None if pose.second is None else _motion(pose.second),
-            "state": "seen",
+            "state": record.state,
         }
+    if record.filtered is not None:
+        filtered = _motion(record.filtered) | {"covariance": record.filtered.covariance.tolist()}
+        content |= {"state": record.state, "filtered": filtered}
     return content | {"reason": record.reason or None}
 
 
@@ -115,10 +207,9 @@ def _encode_csv(records: Sequence[PoseRecord]) -> bytes:
         row |= {"file": escape_csv(content["file"] or ""), "board": escape_csv(record.board)}
         if record.pose is not None:
             row |= dict(zip(MATRIX_COLUMNS, record.pose.rotation.ravel().tolist(), strict=True))
-            upper = [v for k, line in enumerate(content["covariance"]) for v in line[k:]]
-            row |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
             row |= _flatten(content, "") | _flatten(content["second"], "second_")
             row["ambiguous"] = int(record.pose.ambiguous)
+        row |= _flatten(content["filtered"], "filtered_")
         writer.writerow(row)
     return encode_utf8(text.getvalue())
 
@@ -126,6 +217,9 @@ def _encode_csv(records: Sequence[PoseRecord]) -> bytes:
 def _flatten(motion: dict[str, Any] | None, prefix: str) -> dict[str, float]:
     if motion is None:
         return {}
-    names = ("qx", "qy", "qz", "qw", "tx_mm", "ty_mm", "tz_mm")
     values = [*motion["quaternion_xyzw"], *motion["translation_mm"]]
-    return {f"{prefix}{name}": value for name, value in zip(names, values, strict=True)}
+    row = dict(zip(MOTION_COLUMNS, values, strict=True))
+    if "covariance" in motion:
+        upper = [v for k, line in enumerate(motion["covariance"]) for v in line[k:]]
+        row |= dict(zip(COVARIANCE_COLUMNS, upper, strict=True))
+    return {f"{prefix}{name}": value for name, value in row.items()}

@@ -14,6 +14,7 @@ from kpbench.cli.options import FINITE, PATCHES, WORKERS
 
 if TYPE_CHECKING:
     from kpbench.boards.images import PoseRecord
+    from kpbench.detectors.interface import LoadedDetector
     from kpbench.detectors.prediction import Sink
     from kpbench.patches.design import Patch
     from kpbench.types import Predictions
@@ -64,6 +65,11 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
     type=click.Path(dir_okay=False, path_type=Path),
     help="File of poses to write (.csv, .jsonl): a line per image and board. Needs --board and --camera.",
 )
+@click.option(
+    "--second-look",
+    is_flag=True,
+    help="Look for patches that the detector missed, where their board says that they must be. Runs in one process.",
+)
 @PATCHES
 @WORKERS
 def detect(
@@ -75,6 +81,7 @@ def detect(
     board_names: tuple[str, ...],
     camera: Path | None,
     poses: Path | None,
+    second_look: bool,
     patches: tuple[Path, ...],
     workers: int | None,
 ) -> None:
@@ -94,6 +101,7 @@ def detect(
       kpbench detect film.mp4 --detector my-weights.onnx --overlay drawn.mp4
       kpbench detect camera:0 --detector superpoint-small --out -
       kpbench detect film.mp4 --board patches-print/grid.json --camera camera.yaml --poses poses.csv
+      kpbench detect photos --board patches-print/grid.json --second-look
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.detectors.interface import load_detector
@@ -105,8 +113,8 @@ def detect(
 
     if patches and detector != "template":
         raise click.UsageError(f"--patches is for the template detector; {detector} does not take designs")
-    if (not board_names and (camera or poses)) or (poses and not camera):
-        raise click.UsageError("--poses needs --board and --camera, and --camera needs --board")
+    if (not board_names and (camera or poses or second_look)) or (poses and not camera):
+        raise click.UsageError("--poses needs --board and --camera; --camera and --second-look need --board")
     is_streamed = str(out) == "-"
     if not is_streamed:
         require_predictions_path(out)
@@ -118,7 +126,8 @@ def detect(
             f"{sources[0]} holds other designs than {detector} looks for; use template with `patches`, "
             "or weights trained on the other designs"
         )
-    loaded = load_detector(detector, threshold, designs) if designs else detector
+    loaded = load_detector(detector, threshold, designs) if designs or second_look else detector
+    loaded = finder.look_twice(loaded) if second_look else loaded
     try:
         with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
             options: dict[str, Any] = {
@@ -138,11 +147,15 @@ def detect(
     echo(f"{name}: {len(run.predictions.xy)} detections in {len(run.predictions)} images", err=is_streamed)
     if run.failures:
         pairs = [f"{label}: {problem}" for label, problem in run.failures]
-        lines = images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs
-        for line in lines[:5]:
-            print_warning(line)
-        print_warning(f"{len(run.failures)} images failed and count as images without detections")
-        raise SystemExit(1)
+        _fail(images.describe_failures(run.failures) if isinstance(images, ImageSource) else pairs, len(run.failures))
+
+
+def _fail(lines: Sequence[str], count: int) -> None:
+    """Print the first lines about images that failed, and exit."""
+    for line in lines[:5]:
+        print_warning(line)
+    print_warning(f"{count} images failed and count as images without detections")
+    raise SystemExit(1)
 
 
 class BoardFinder:
@@ -159,6 +172,14 @@ class BoardFinder:
         self.boards = [board for name in names for board in load_boards(name, patches)]
         self.camera = None if camera is None else read_camera(camera)
         self.records: list[PoseRecord] = []
+
+    def look_twice(self, detector: str | LoadedDetector) -> LoadedDetector:
+        """Return a detector that also finds the patches that it missed on the boards."""
+        from kpbench.detectors.interface import load_detector
+        from kpbench.tracking.second_look import look_twice
+
+        loaded = load_detector(detector) if isinstance(detector, str) else detector
+        return look_twice(loaded, self.boards, self.camera)
 
     def locate(self, predictions: Predictions) -> Predictions:
         """Return predictions with the points of the boards."""

@@ -35,6 +35,13 @@ from kpbench.cli.options import Finite, Two
 @click.option("--landscape", is_flag=True, help="Use the page in landscape format.")
 @click.option("--dpi", type=click.IntRange(36, 4800), default=600, show_default=True, help="Resolution of the PNG.")
 @click.option("--board", metavar="hexagon|grid|FILE.toml", help="Print a board instead of patches to cut out.")
+@click.option(
+    "--target",
+    "targets",
+    type=click.Choice(["opencv", "kalibr", "mrcal"]),
+    multiple=True,
+    help="Also write the board for this program, into the subfolder targets; repeatable. Needs --board.",
+)
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
     "--design",
@@ -76,6 +83,7 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
+    targets: tuple[str, ...],
     tile: bool,
     designs: tuple[Path, ...],
     chosen: tuple[str, ...],
@@ -96,6 +104,7 @@ def render_patches(
       kpbench render-patches --svg --dxf --diameter-mm 50 --design my-patch.toml
       kpbench render-patches --board hexagon --patch 0
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
+      kpbench render-patches --board grid --target opencv --target kalibr
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
@@ -105,6 +114,7 @@ def render_patches(
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
     from kpbench.printing.sidecar import correct_sidecars
+    from kpbench.printing.targets import write_targets
 
     given = {name for name in ctx.params if ctx.get_parameter_source(name) is not click.core.ParameterSource.DEFAULT}
     _check_usage(given, board)
@@ -121,7 +131,7 @@ def render_patches(
     with progress_bar(len(boards) or 1, "print", unit="sheet", shown=png) as progress:
         layout |= {"formats": wanted, "progress": progress}
         if board is not None:
-            files = print_boards(boards, out, tile=tile, **layout)
+            files = [*print_boards(boards, out, tile=tile, **layout), *write_targets(boards, out, targets)]
         else:
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
     for path in files:
@@ -136,6 +146,8 @@ def _check_usage(given: set[str], board: str | None) -> None:
     """Refuse options that do not go together."""
     if "measured" in given and given - {"measured", "out"}:
         raise click.UsageError("--measured corrects the sidecars in --out and takes no other option.")
+    if board is None and "targets" in given:
+        raise click.UsageError("--target describes a board; give --board.")
     if board is None and "tile" in given:
         raise click.UsageError("--tile spreads a board; give --board.")
     if board is not None and "copies" in given:

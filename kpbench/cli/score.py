@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -20,11 +21,12 @@ class Limit(click.ParamType[tuple[str, float]]):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
         from kpbench.scoring.metrics import METRICS
+        from kpbench.scoring.tracks import TRACK_METRICS
 
         if isinstance(value, tuple):
             return value
         metric, _, number = str(value).partition("=")
-        if metric not in METRICS:
+        if metric not in (*METRICS, *TRACK_METRICS):
             self.fail(f"there is no metric {metric!r}, only {', '.join(METRICS)}", param, ctx)
         try:
             limit = float(number)
@@ -107,19 +109,45 @@ def score(
 ) -> None:
     """Score a predictions file (.json, .jsonl, .csv, .parquet, .h5) against a dataset's true keypoints.
 
+    A file of poses (.jsonl, .csv) is scored against the true poses of a dataset of films, see `kpbench track`.
+
     \b
     Examples:
       kpbench score preds.json
       kpbench score preds.json --report report.html
       kpbench score preds.json --gt val --min detection_score=0.95 --max average_false_alarm=0.5
+      kpbench score poses.jsonl --gt kpbench-suite/video-v1 --min frames_with_pose=0.9
     """
+    from kpbench.boards.pose_files import holds_poses
     from kpbench.evaluate import score_file
     from kpbench.report.summary import summarise_scores
     from kpbench.scoring.scores import check_gates
 
+    if holds_poses(preds):
+        _score_poses(preds, dict(least), dict(most), **arguments)
+        return
     scored = score_file(preds, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
     scores, dataset = scored.scores, scored.dataset
     echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
     echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
     echo(summarise_scores(scores, scored.poses), lines=True)
     check_gates(scores, dict(least), dict(most))
+
+
+def _score_poses(
+    poses: Path, least: dict[str, float], most: dict[str, float], truth: Path | None, json_file: Path | None, **_: Any
+) -> None:
+    """Score a file of poses; the options that are for predictions alone are of no effect."""
+    from kpbench.scoring.scores import check_gates
+    from kpbench.tracking.scores import score_poses, summarise_tracks
+    from kpbench.writing import require_writable, write_file
+
+    if truth is None:
+        raise click.UsageError(f"{poses} holds poses; --gt must name the dataset of films")
+    if json_file is not None:
+        require_writable(json_file, "scores")
+    scores = score_poses(poses, truth)
+    if json_file is not None:
+        write_file(json_file, json.dumps(scores.to_dict(), indent=1).encode())
+    echo(summarise_tracks(scores), lines=True)
+    check_gates(scores, least, most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +35,9 @@ class Distortion(click.ParamType[tuple[float, ...]]):
     "--images",
     type=int,
     help="Number of base scenes. Each scene is rendered with every patch under every rung. "
-    "Default: 500 for shipped suites, else as in the .toml file.",
+    "Default: 500 for shipped suites, 10 films for video-v1, else as in the .toml file.",
 )
+@click.option("--frames", type=click.IntRange(2, 100_000), help="Frames of a film, for video-v1. Default: 60.")
 @SEED
 @BACKGROUNDS
 @click.option(
@@ -54,6 +56,7 @@ def suite(
     name: str,
     out: Path | None,
     images: int | None,
+    frames: int | None,
     seed: int,
     backgrounds: Path | None,
     size: tuple[int, int] | None,
@@ -65,7 +68,7 @@ def suite(
 ) -> None:
     """Write the images of a benchmark suite into a dataset folder.
 
-    NAME is paper-v1, extended-v1, camera-v1, or a .toml file of your own.
+    NAME is paper-v1, extended-v1, camera-v1, video-v1, or a .toml file of your own.
 
     \b
     Examples:
@@ -73,6 +76,7 @@ def suite(
       kpbench suite paper-v1 --only scale,blur --backgrounds photos/ --out scale-and-blur
       kpbench suite paper-v1 --board aruco
       kpbench suite paper-v1 --camera webcam
+      kpbench suite video-v1 --images 1 --frames 10 --size 406x310
     """
     from kpbench.camera.preset import load_camera_preset
     from kpbench.cli.synth import write_dataset
@@ -80,7 +84,10 @@ def suite(
     from kpbench.synth.suite_file import load_suite
 
     preset = None if camera is None else load_camera_preset(camera)
-    config = SuiteConfig(
-        load_suite(name), images, seed, size, only, backgrounds, distortion or (), board, preset=preset
-    )
+    content = load_suite(name)
+    if frames is not None:
+        if content.film is None:
+            raise click.UsageError(f"--frames is for suites of films; {name} has none")
+        content = replace(content, film=replace(content.film, frames=frames))
+    config = SuiteConfig(content, images, seed, size, only, backgrounds, distortion or (), board, preset=preset)
     write_dataset(config, out or Path("kpbench-suite") / config.name, "suite", **run)

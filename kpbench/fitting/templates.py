@@ -143,7 +143,7 @@ def _linearise(image: Float32, points: Float) -> tuple[Float, Float]:
 
 
 @lru_cache(maxsize=64)
-def draw_ink(patch: Patch, whole: bool) -> Float32:
+def draw_ink(patch: Patch, whole: bool, blur: float | None = None) -> Float32:
     """Return a blurred image of a design's ink, white 1 and black -1, over [-VIEW_REACH, VIEW_REACH]² of its frame.
 
     Parameters
@@ -152,7 +152,14 @@ def draw_ink(patch: Patch, whole: bool) -> Float32:
     whole : bool
         True draws the design, with its outermost ring continued outwards. False draws the innermost sectors alone,
         continued outwards.
+    blur : float, optional
+        Standard deviation of the blur, in disc radii; 0 for none. None: the blur of templates.
     """
+    if blur is None:
+        blur = WHOLE_BLUR if whole else CORE_BLUR
+    if blur:
+        sharp, blur_px = draw_ink(patch, whole, 0.0), blur * _INK_PX / (2 * VIEW_REACH)
+        return np.asarray(cv2.GaussianBlur(sharp, (0, 0), blur_px))
     fine = 3
     ticks = ((np.arange(_INK_PX * fine) + 0.5) / (_INK_PX * fine) * 2 - 1) * VIEW_REACH
     points = np.stack(np.meshgrid(ticks, ticks), axis=-1)
@@ -161,9 +168,7 @@ def draw_ink(patch: Patch, whole: bool) -> Float32:
     radius = np.hypot(*np.moveaxis(points, -1, 0)) + 1e-9
     looked_up = np.minimum(radius, 0.999) if whole else 0.5 * patch.cells[0][1]
     black = patch.is_black(points * (looked_up / radius)[..., None])
-    ink = np.where(black, -1.0, 1.0).reshape(_INK_PX, fine, _INK_PX, fine).mean(axis=(1, 3))
-    blur = (WHOLE_BLUR if whole else CORE_BLUR) * _INK_PX / (2 * VIEW_REACH)
-    return np.asarray(cv2.GaussianBlur(ink.astype(np.float32), (0, 0), blur))
+    return np.asarray(np.where(black, -1, 1).reshape(_INK_PX, fine, _INK_PX, fine).mean(axis=(1, 3)), np.float32)
 
 
 def look_up_ink(image: Float32, points: Float) -> Float:

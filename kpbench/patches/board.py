@@ -196,6 +196,11 @@ class Board:
         return np.array([[k.x_mm, k.y_mm, 0.0] for k in self.keypoints])
 
     @cached_property
+    def A_patch2board(self) -> Float:
+        """Linear map from the disc of each keypoint to mm of the board frame, ndarray of shape (N, 2, 2)."""
+        return np.stack([k.H_patch2board[:2, :2] for k in self.keypoints])
+
+    @cached_property
     def orientations(self) -> tuple[Int, Float, Float]:
         """Every keypoint in every rotation of its patch that leaves the print unchanged (point, turn, A_board2patch).
 

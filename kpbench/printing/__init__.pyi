@@ -15,5 +15,6 @@ from .sheet import board_sheet as board_sheet
 from .sheet import patch_sheet as patch_sheet
 from .sidecar import correct_sidecars as correct_sidecars
 from .svg import to_svg as to_svg
+from .targets import write_targets as write_targets
 
 __all__: list[str]

@@ -26,5 +26,9 @@ from .scores import Scores as Scores
 from .scores import check_gates as check_gates
 from .scores import compute_scores as compute_scores
 from .scores import score as score
+from .tracks import TRACK_METRICS as TRACK_METRICS
+from .tracks import FilmTruth as FilmTruth
+from .tracks import PoseSeries as PoseSeries
+from .tracks import score_tracks as score_tracks
 
 __all__: list[str]

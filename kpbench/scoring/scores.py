@@ -309,12 +309,20 @@ def compute_scores(outcomes: Outcomes) -> Scores:
     return Scores(overall, tuple(by), _count_confusions(outcomes), _trace_curve(outcomes), outcomes, name or "detector")
 
 
-def check_gates(scores: Scores, least: dict[str, float], most: dict[str, float]) -> None:
+class Measured(Protocol):
+    """Scores whose metrics over all images can be asked for by name."""
+
+    def __getitem__(self, metric: str) -> float | None:
+        """Return a metric; None if it is undefined."""
+        ...
+
+
+def check_gates(scores: Measured, least: dict[str, float], most: dict[str, float]) -> None:
     """Raise an error if a metric misses its limit. An undefined metric misses every limit.
 
     Parameters
     ----------
-    scores : Scores
+    scores : Scores or kpbench.tracking.TrackScores
     least, most : dict of str to float
         Smallest and largest accepted value of metrics over all images, by name of the metric.
 

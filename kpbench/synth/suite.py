@@ -13,11 +13,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
 from kpbench.camera.preset import CameraPreset
 from kpbench.dataset.shard import Sample
-from kpbench.degrade.effects import Effect
 from kpbench.degrade.ladder import draw_effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
@@ -26,53 +23,23 @@ from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
-from kpbench.seeds import SUITE_BACKGROUND, SUITE_CAMERA, SUITE_EFFECT, SUITE_FIELD, SUITE_SCENE, SUITE_SENSOR, stream
+from kpbench.seeds import (
+    SUITE_BACKGROUND,
+    SUITE_CAMERA,
+    SUITE_EFFECT,
+    SUITE_FIELD,
+    SUITE_FILM,
+    SUITE_SCENE,
+    SUITE_SENSOR,
+    stream,
+)
 from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
+from kpbench.synth.film import FILM_KEYS, draw_bar, draw_path, film_record
 from kpbench.synth.finish import degrade_scene, discs_of
 from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, suite_boards
 from kpbench.synth.suite_file import Condition, Suite
-
-
-@dataclass(frozen=True)
-class View:
-    """Everything that one image of a suite shows, except the background, before anything is painted.
-
-    Attributes
-    ----------
-    condition : str
-    rung : float
-    scene_id : int
-        The base scene.
-    board : Board or TagBoard
-    pose : Pose
-    appearance : Appearance
-    effects : list of dict
-        Records of the effects, see :func:`kpbench.degrade.draw_effect`.
-    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
-        The truth before occlusion; ``contrast`` is nan.
-    camera : Camera
-        Lens and size of the image.
-    taken : dict or None
-        What the camera drew, see :meth:`kpbench.camera.CameraPreset.draw`. None without a preset.
-
-    Examples
-    --------
-    >>> from kpbench import SuiteConfig, load_suite
-    >>> view = SuiteConfig(load_suite("paper-v1"), images=2).view(0)
-    >>> view.condition, view.rung, len(view.keypoints)
-    ('scale', 0.5, 6)
-    """
-
-    condition: str
-    rung: float
-    scene_id: int
-    board: BoardLike
-    pose: Pose
-    appearance: Appearance
-    effects: list[Effect]
-    keypoints: NDArray[Any]
-    camera: Camera
-    taken: Effect | None = None
+from kpbench.synth.suite_view import View
+from kpbench.types import Float
 
 
 @dataclass(frozen=True)
@@ -189,7 +156,7 @@ class SuiteConfig:
     @cached_property
     def boards(self) -> tuple[BoardLike, ...]:
         """The boards. Every base scene is shown with each board under every rung, or with boards of a single patch."""
-        return suite_boards(self.suite.patches, self.board)
+        return suite_boards(self.suite.patches, self.board, "mixed" if self.suite.film else "hexagon")
 
     @cached_property
     def _single_boards(self) -> tuple[BoardLike, ...]:
@@ -203,8 +170,13 @@ class SuiteConfig:
 
     @property
     def n(self) -> int:
-        """Number of images: rungs x boards x scenes."""
-        return len(self.rungs) * len(self.boards) * self.scenes
+        """Number of images: rungs x boards x scenes x frames."""
+        return len(self.rungs) * len(self.boards) * self.scenes * self._frames
+
+    @property
+    def _frames(self) -> int:
+        """Images of a base scene under one rung."""
+        return self.suite.film.frames if self.suite.film else 1
 
     @property
     def image_bytes(self) -> int:
@@ -248,12 +220,13 @@ class SuiteConfig:
             "scene": {key: list(span) for key, span in self.suite.scene},
             "conditions": [_describe_condition(c) for c in conditions],
             **({} if preset is None else {"preset": preset.to_dict()}),
+            **({} if self.suite.film is None else {"film": self.suite.film.to_dict()}),
             **targets,
         }
 
     def scene_id(self, index: int) -> int:
-        """Return the base scene of an image. Images are ordered by condition, rung, board and base scene."""
-        return index % self.scenes
+        """Return the base scene of an image. Images are ordered by condition, rung, board, base scene and frame."""
+        return index // self._frames % self.scenes
 
     def view(self, index: int) -> View:
         """Draw pose, inks, light and effects of one image, and compute the truth. Nothing is painted.
@@ -264,7 +237,7 @@ class SuiteConfig:
             0 to n − 1.
         """
         scene_id = self.scene_id(index)
-        rung, which_board = divmod(index // self.scenes, len(self.boards))
+        rung, which_board = divmod(index // self._frames // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
         board = (self._single_boards if condition.board == "single" else self.boards)[which_board]
         rng = stream(self.seed, scene_id, SUITE_SCENE)
@@ -273,16 +246,16 @@ class SuiteConfig:
         preset = self.presets[rung]
         taken = None if preset is None else preset.draw(stream(self.seed, scene_id, SUITE_CAMERA))
         camera = replace(self.camera, distortion=(taken["k1"], 0.0, 0.0, 0.0)) if taken and taken["k1"] else self.camera
-        pose = pose_board(
-            camera,
-            board,
-            drawn["area_percent"],
-            pitch_deg=drawn["pitch_deg"],
-            yaw_deg=drawn["yaw_deg"],
-            roll_deg=drawn["roll_deg"],
-            shift=(drawn["shift_x"], drawn["shift_y"]),
-            inside_mm=disc_outline(board) if condition.board == "single" else None,
-        )
+        inside_mm = disc_outline(board) if condition.board == "single" else None
+        film, frame, record = self.suite.film, index % self._frames, None
+        if film is None:
+            pose = _pose(camera, board, drawn, inside_mm)
+        else:
+            rates = {key: levels[step] * (film.fps if key == "speed_px" else 1) for key, levels in condition.film}
+            moves = stream(self.seed, scene_id, SUITE_FILM)
+            path = draw_path(moves, camera, board, drawn["area_percent"], **{k: rates[k] for k in FILM_KEYS})
+            pose = path.pose(frame / film.fps)
+            record = film_record(film, frame, pose)
         appearance = Appearance(
             drawn["black"],
             drawn["white"],
@@ -291,15 +264,17 @@ class SuiteConfig:
             slope=(drawn["slope_x"], drawn["slope_y"]),
             shadow=drawn["shadow"],
         )
-        if taken:
-            keypoints = expose_board(board, pose, camera, taken).keypoints(camera)
-        else:
-            keypoints = board_keypoints(camera, pose, board)
+        exposed = expose_board(board, pose, camera, taken) if taken else None
+        if exposed and film:
+            exposed = replace(exposed, motion=path.motion(frame / film.fps, film.exposure / film.fps))
+        keypoints = exposed.keypoints(camera) if exposed else board_keypoints(camera, pose, board)
         rng, size_px = stream(self.seed, scene_id, SUITE_EFFECT), (self.camera.width_px, self.camera.height_px)
         discs = discs_of(keypoints)
         effects = [draw_effect(rng, name, levels[step], size_px, discs) for name, levels in condition.effects]
+        if film:
+            effects += draw_bar(moves, film, frame, camera, board, pose)
         what = (condition.name, condition.rungs[step], scene_id)
-        return View(*what, board, pose, appearance, effects, keypoints, camera, taken)
+        return View(*what, board, pose, appearance, effects, keypoints, camera, exposed, taken, record)
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         """Make one image. The result is a function of the config, the index and the background files.
@@ -318,10 +293,10 @@ class SuiteConfig:
         view = self.view(index)
         taken = view.taken
         background = self._find_background(view.scene_id, 3 if taken and needs_colour(taken) else 1)
-        if taken:
-            exposed = expose_board(view.board, view.pose, view.camera, taken)
-            rng = stream(self.seed, view.scene_id, SUITE_SENSOR)
-            clean = photograph_board(background.image, view.camera, exposed, view.appearance, rng, taken)
+        if taken and view.exposed:
+            shot = view.scene_id * self._frames + index % self._frames
+            rng = stream(self.seed, shot, SUITE_SENSOR)
+            clean = photograph_board(background.image, view.camera, view.exposed, view.appearance, rng, taken)
         else:
             clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)
         scene = degrade_scene(clean, stream(self.seed, view.scene_id, SUITE_FIELD), view.effects)
@@ -329,7 +304,7 @@ class SuiteConfig:
             index,
             scene.image,
             scene.keypoints,
-            [*([taken] if taken else []), *view.effects],
+            [record for record in (view.frame, taken, *view.effects) if record],
             background.file,
             condition=view.condition,
             rung=view.rung,
@@ -357,11 +332,19 @@ class SuiteConfig:
         return background
 
 
+def _pose(camera: Camera, board: BoardLike, drawn: dict[str, float], inside_mm: Float | None) -> Pose:
+    angles = {key: drawn[key] for key in ("pitch_deg", "yaw_deg", "roll_deg")}
+    shift = drawn["shift_x"], drawn["shift_y"]
+    return pose_board(camera, board, drawn["area_percent"], **angles, shift=shift, inside_mm=inside_mm)
+
+
 def _describe_condition(condition: Condition) -> dict[str, Any]:
     """Return a condition for the config; the effects are a list, because their order matters."""
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]
     described = {"name": condition.name, "rungs": list(condition.rungs), "pose": pose, "effects": effects}
+    if condition.film:
+        described["film"] = {key: list(values) for key, values in condition.film}
     if condition.camera:
         described["camera"] = {key: list(values) for key, values in condition.camera}
     return described | ({} if condition.board == "hexagon" else {"board": condition.board})

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.homography import project
-from kpbench.patches.board import BoardLike, hexagon_board, single_board
-from kpbench.patches.design import Patch, shipped_patches
+from kpbench.patches.board import Board, BoardLike, hexagon_board, single_board
+from kpbench.patches.design import Patch, parse_patch, shipped_patches
 from kpbench.patches.tag_boards import tag_board
 from kpbench.portable import cos_sin
 from kpbench.types import Float
@@ -27,13 +28,30 @@ def suite_boards(patches: Sequence[Patch], tags: str | None, kind: str = "hexago
     patches : sequence of Patch
     tags : str or None
         Name of a board of tags, which replaces the boards of patches.
-    kind : {"hexagon", "single"}
-        Boards of six patches, or of a single patch.
+    kind : {"hexagon", "single", "mixed"}
+        Boards of six patches, or of a single patch; or one board of six patches of all designs in turn.
     """
     if tags is not None:
         return (tag_board(tags, BOARD_SIDE_MM),)
+    if kind == "mixed":
+        return (mixed_board(patches),)
     make = single_board if kind == "single" else hexagon_board
     return tuple(make(patch, BOARD_SIDE_MM) for patch in patches)
+
+
+def mixed_board(patches: Sequence[Patch]) -> Board:
+    """Return the hexagon board with all designs in turn, which is the board of films.
+
+    Examples
+    --------
+    >>> from kpbench import shipped_patches
+    >>> from kpbench.synth.suite_boards import mixed_board
+    >>> [keypoint.patch_id for keypoint in mixed_board(shipped_patches()).keypoints]
+    [0, 1, 2, 3, 0, 1]
+    """
+    hexagon = hexagon_board(patches[0], BOARD_SIDE_MM)
+    keypoints = tuple(replace(k, patch=patches[n % len(patches)]) for n, k in enumerate(hexagon.keypoints))
+    return replace(hexagon, name="mixed", keypoints=keypoints)
 
 
 def disc_outline(board: BoardLike) -> Float:
@@ -76,3 +94,28 @@ def board_in_view(config: Mapping[str, Any]) -> tuple[Float, Camera] | None:
         return np.array([[x, y, 0.0] for _, x, y, _ in config["board"]["keypoints"]]), camera
     # the keypoints of hexagon boards have the same positions, whatever the patch
     return hexagon_board(shipped_patches()[0], BOARD_SIDE_MM).points_mm, camera
+
+
+def film_board(config: Mapping[str, Any]) -> tuple[Board, Camera] | None:
+    """Return the board and the camera of the films of a dataset; None if the dataset does not tell both.
+
+    A camera whose lens differs from film to film is not told, nor a board of tags.
+
+    Parameters
+    ----------
+    config : mapping
+        The ``config`` of the dataset.
+
+    Examples
+    --------
+    >>> from kpbench import SuiteConfig, load_suite
+    >>> from kpbench.synth.suite_boards import film_board
+    >>> board, camera = film_board(SuiteConfig(load_suite("video-v1")).to_dict())
+    >>> board.name, camera.width_px
+    ('mixed', 1624)
+    """
+    if "film" not in config or "patches" not in config or config["preset"]["k1"] or "calibration" in config["preset"]:
+        return None
+    width, height = config["size_px"]
+    camera = Camera(width, height, config["focal_px"], tuple(config["distortion"]))
+    return mixed_board([parse_patch(table, "the dataset") for table in config["patches"]]), camera

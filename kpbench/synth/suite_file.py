@@ -12,11 +12,12 @@ from kpbench.files import find_shipped, shipped_files
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board_file import find_patch
 from kpbench.patches.design import Patch, shipped_patches
+from kpbench.synth.film import FILM_BOUNDS, FILM_KEYS, FilmPlan
 from kpbench.toml import TomlTable, name_source, read_toml
 
 SUITE_SCHEMA = "kpbench.suite/1"
-SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition")
-CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board")
+SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition", "film")
+CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board", "film")
 BOARDS = ("hexagon", "single")
 """Boards of patches of a condition: :func:`kpbench.hexagon_board`, or one patch almost as large as the board."""
 SCENE_KEYS = {
@@ -65,6 +66,9 @@ class Condition:
         :data:`kpbench.camera.preset.QUANTITIES`, ``tone`` and ``bayer``.
     board : {"hexagon", "single"}
         See :data:`BOARDS`.
+    film : tuple of (str, tuple of float)
+        Quantities of :data:`kpbench.synth.film.FILM_KEYS`, each with one value per rung; empty if the suite has no
+        films.
 
     Examples
     --------
@@ -81,6 +85,7 @@ class Condition:
     effects: Levels
     camera: CameraLevels = ()
     board: str = "hexagon"
+    film: Levels = ()
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,8 @@ class Suite:
     conditions : tuple of Condition
     preset : CameraPreset or None
         The camera that takes the images, in linear light. None: a linear world, in which inks keep their levels.
+    film : FilmPlan or None
+        Every base scene is a film. None: every base scene is one image.
 
     Examples
     --------
@@ -122,6 +129,7 @@ class Suite:
     scene: tuple[tuple[str, tuple[float, float]], ...]
     conditions: tuple[Condition, ...]
     preset: CameraPreset | None = None
+    film: FilmPlan | None = None
 
     def camera(self, size_px: tuple[int, int] | None = None, distortion: tuple[float, ...] = ()) -> Camera:
         """Return the camera of the suite, or a camera of another image size with the same horizontal field of view.
@@ -146,7 +154,7 @@ def shipped_suites() -> dict[str, Path]:
     --------
     >>> from kpbench.synth import shipped_suites
     >>> list(shipped_suites())
-    ['camera-v1', 'extended-v1', 'paper-v1']
+    ['camera-v1', 'extended-v1', 'paper-v1', 'video-v1']
     """
     return shipped_files("suites")
 
@@ -186,7 +194,10 @@ def _parse_suite(table: TomlTable) -> Suite:
     names = [c.name for c in conditions]
     if len(set(names)) < len(names):
         raise DataError(f"two conditions share a name, among: {', '.join(names)}")
-    has_preset = any(key in camera for key in QUANTITIES) or any(c.camera for c in conditions)
+    film = FilmPlan.parse(table.table("film", ("frames", "fps", "exposure", "occluded"))) if "film" in table else None
+    if any(bool(c.film) != (film is not None) for c in conditions):
+        raise DataError("expected a table `film` in the suite and in every condition, or in none")
+    has_preset = film is not None or any(key in camera for key in QUANTITIES) or any(c.camera for c in conditions)
     width, height = camera.numbers("size_px", 64, 16384, 2, whole=True)
     return Suite(
         name=table.name(),
@@ -198,6 +209,7 @@ def _parse_suite(table: TomlTable) -> Suite:
         scene=tuple((key, scene.span(key, *bounds)) for key, bounds in SCENE_KEYS.items()),
         conditions=conditions,
         preset=parse_preset(camera, table.name()) if has_preset else None,
+        film=film,
     )
 
 
@@ -207,6 +219,7 @@ def _parse_condition(table: TomlTable) -> Condition:
     pose = table.table("pose", SCENE_KEYS, {})
     effects = table.table("effects", LADDER, {})
     camera = table.table("camera", (*CAMERA_BOUNDS, "tone", "bayer"), {})
+    film = table.table("film", FILM_KEYS, {})
     return Condition(
         name=table.name(),
         unit=table.text("unit"),
@@ -215,6 +228,7 @@ def _parse_condition(table: TomlTable) -> Condition:
         effects=tuple((key, effects.numbers(key, *LADDER[key].bounds, len(rungs))) for key in effects.values),
         camera=tuple((key, _parse_camera_levels(camera, key, len(rungs))) for key in camera.values),
         board=table.choice("board", BOARDS, "hexagon"),
+        film=tuple((key, film.numbers(key, *FILM_BOUNDS[key], len(rungs))) for key in FILM_KEYS if film.values),
     )
 
 

@@ -130,8 +130,11 @@ def test_what_has_no_pose_is_said_in_one_line():
         return BoardMatch(board, np.arange(n), np.array(points), found, np.ones(n, bool))
 
     assert estimate_pose(match([0, 1, 2, 4]), CAMERA).points == 4
-    with pytest.raises(DataError, match="board 'grid': 3 points, expected at least 4"):
-        estimate_pose(match([0, 1, 4]), CAMERA)
+    three = estimate_pose(match([0, 1, 4]), CAMERA)
+    assert three.ambiguous
+    assert three.reprojection_rms_px < 1e-3
+    with pytest.raises(DataError, match="board 'grid': 2 points, expected at least 3"):
+        estimate_pose(match([0, 1]), CAMERA)
     with pytest.raises(DataError, match="4 points on one line"):
         estimate_pose(match([0, 3, 6, 9]), CAMERA)
     fold = Camera(1624, 1240, 889.0, (-0.9, 0.0, 0.0, 0.0))

@@ -499,7 +499,7 @@ def test_boards_go_into_the_stream(film):
         (("--board", "square.toml", "--camera", "small.yaml"), 1, "photos/0.png: the image has 640x480 px, expected"),
         (("--board", "square.toml", "--camera", "camera.yaml", "--poses", "p.txt"), 1, "p.txt: unknown kind of poses"),
         (("--board", "square.toml", "--poses", "p.csv"), 2, "--poses needs --board and --camera"),
-        (("--camera", "camera.yaml"), 2, "--camera needs --board"),
+        (("--camera", "camera.yaml"), 2, "--camera and --second-look need --board"),
     ],
 )
 def test_what_is_wrong_with_boards_and_cameras_is_one_line(film, options, code, message):

@@ -11,7 +11,8 @@ def test_the_suite_command(tmp_path):
     assert "already holds a dataset" in again.stderr
     unknown = kpbench("suite", "paper-v9", code=1)
     assert unknown.stderr == (
-        "kpbench: there is no suite 'paper-v9', only: camera-v1, extended-v1, paper-v1, or a .toml file of your own\n"
+        "kpbench: there is no suite 'paper-v9', only: camera-v1, extended-v1, paper-v1, video-v1, "
+        "or a .toml file of your own\n"
     )
     kpbench("suite", "paper-v1", "--distortion", "much", code=2)
 
@@ -31,3 +32,10 @@ def test_a_camera_that_cannot_be_used_is_one_line(tmp_path):
         done = kpbench(*made, name, code=1)
         assert done.stderr.startswith(f"kpbench: {problem}")
         assert done.stderr.count("\n") == 1
+
+
+def test_films_may_be_short(tmp_path):
+    made = ("suite", "video-v1", "--images", 1, "--frames", 2, "--size", "203x155", "--workers", 1)
+    assert "8 images" in kpbench(*made, "--out", tmp_path / "films").stdout
+    other = kpbench("suite", "paper-v1", "--frames", 2, code=2)
+    assert "--frames is for suites of films; paper-v1 has none" in other.stderr

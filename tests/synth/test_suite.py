@@ -75,7 +75,7 @@ def test_the_papers_conditions_are_the_papers():
         "noise": (15, 30, 45, 60),
     }
     assert SuiteConfig(load_suite("paper-v1")).n == 26 * 4 * 500
-    assert sorted(shipped_suites()) == ["camera-v1", "extended-v1", "paper-v1"]
+    assert sorted(shipped_suites()) == ["camera-v1", "extended-v1", "paper-v1", "video-v1"]
 
 
 def test_one_scene_is_the_same_under_every_rung_and_patch():
