@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
-from kpbench.fitting.covariance import LAST_STEP_SHARE, LIGHT_SLOPE, UNEVEN_BLUR_PX2, start_covariance
-from kpbench.fitting.design_fit import EXPECTED_TONE, MARGIN_BLURS
+from kpbench.fitting.covariance import UNEVEN_BLUR_PX2, start_covariance
+from kpbench.fitting.design_fit import EXPECTED_LIGHT, EXPECTED_TONE, MARGIN_BLURS
 from kpbench.fitting.templates import draw_ink, look_up_ink
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -41,6 +41,8 @@ GRAIN = 2.0
 REJECTED_RADII = 0.02
 """Standard deviation of the centre, in short semi-axes, is this times the square of the rejected share of the
 weights."""
+LAST_STEP_SHARE = 0.3
+"""Standard deviation of the rest of the way, in last steps of the centre."""
 COLUMNS = 14
 """Unknowns: grey, contrast, place (2), affine map (4), blur, tone, light along x and y, uneven blur (2)."""
 
@@ -132,10 +134,8 @@ def fit_samples(
         target = (weighted @ residual[..., None]).astype(np.float64)
         squares = np.einsum("nm,nm->n", weight, residual**2)
         noise2 = np.maximum(squares / np.maximum(count - COLUMNS, 8), (LEAST_NOISE / contrast[:, 0]) ** 2)
-        deviation = np.tile(
-            [np.inf, np.inf, np.inf, np.inf, *(EXPECTED_TURN,) * 4, 0.0, EXPECTED_TONE, *(LIGHT_SLOPE,) * 2, 0.0, 0.0],
-            (len(xy), 1),
-        )
+        fixed = *(np.inf,) * 4, *(EXPECTED_TURN,) * 4, 0.0, EXPECTED_TONE, EXPECTED_LIGHT, EXPECTED_LIGHT, 0.0, 0.0
+        deviation = np.tile(fixed, (len(xy), 1))
         deviation[:, 8] = EXPECTED_BLUR_PX2 * per_px2
         deviation[:, 12:] = (UNEVEN_BLUR_PX2 / 2 * per_px2)[:, None]
         normal[:, range(COLUMNS), range(COLUMNS)] += noise2[:, None] / deviation**2 + 1e-6
