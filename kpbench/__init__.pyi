@@ -30,6 +30,8 @@ from .patches.board_file import load_board as load_board
 from .patches.design import Patch as Patch
 from .patches.design import load_patches as load_patches
 from .patches.design import shipped_patches as shipped_patches
+from .patches.reference_boards import truth_board as truth_board
+from .patches.reference_boards import with_reference as with_reference
 from .predictions.files import read_predictions as read_predictions
 from .predictions.files import write_predictions as write_predictions
 from .printing.prints import print_boards as print_boards
