@@ -6,6 +6,8 @@ from .boards.matching import BoardMatch as BoardMatch
 from .boards.matching import find_board as find_board
 from .boards.pose import BoardPose as BoardPose
 from .boards.pose import estimate_pose as estimate_pose
+from .calibration.camera_solution import Calibration as Calibration
+from .calibration.camera_solution import calibrate as calibrate
 from .dataset.export import export_dataset as export_dataset
 from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
