@@ -8,6 +8,7 @@ from .boards.pose import BoardPose as BoardPose
 from .boards.pose import estimate_pose as estimate_pose
 from .calibration.camera_solution import Calibration as Calibration
 from .calibration.camera_solution import calibrate as calibrate
+from .calibration.label_dataset import label as label
 from .dataset.export import export_dataset as export_dataset
 from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
@@ -50,6 +51,7 @@ from .tracking.scores import score_poses as score_poses
 from .tracking.tracker import TrackedPose as TrackedPose
 from .tracking.tracker import Tracker as Tracker
 from .types import KEYPOINT_DTYPE as KEYPOINT_DTYPE
+from .types import LABELLED_KEYPOINT_DTYPE as LABELLED_KEYPOINT_DTYPE
 from .types import Detections as Detections
 from .types import Predictions as Predictions
 from .types import Truth as Truth

@@ -68,6 +68,7 @@ ROOMS = {
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
     "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],
     "calibration": ["geometry", "patches", "boards", "detectors", "predictions", "dataset", "degrade"],
+    "calibration": ["geometry", "patches", "boards", "render", "detectors", "dataset"],
     "training": [
         "geometry",
         "camera",

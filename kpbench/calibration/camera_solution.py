@@ -178,13 +178,18 @@ def solve_calibration(
     size = used[0].photo.size_px
     camera = start_camera([o.points for o in used], board_mm, size, model, coefficients)
     observed, bundle = solve_and_reject(observed, board_mm, camera, source, has_marks=bool(board.references))
+    require_explained(bundle, source)
+    return Calibration(board, tuple(observed), bundle, compare_halves(bundle, board_mm))
+
+
+def require_explained(bundle: Bundle, source: str) -> None:
+    """Refuse photographs that no camera explains."""
     rms = float(np.median(bundle.rms_px()))
     if rms > LARGEST_RMS_PX:
         raise DataError(
             f"{source}: no camera explains the photographs, the residuals are {rms:.1f} px (median); expected "
             "photographs of this board by one camera with fixed zoom and focus"
         )
-    return Calibration(board, tuple(observed), bundle, compare_halves(bundle, board_mm))
 
 
 def solve_and_reject(
@@ -236,8 +241,11 @@ def _require_photos(observed: Sequence[Observed], source: str, least: int = LEAS
     return used
 
 
-def compare_halves(bundle: Bundle, board_mm: Float) -> Halves | None:
-    """Solve the first and the second half of the photographs apart, in the order of their names."""
+def compare_halves(bundle: Bundle, board_mm: Float, *, solve_camera: bool = True) -> Halves | None:
+    """Solve the first and the second half of the photographs apart, in the order of their names.
+
+    The parameters of the camera are compared; if the camera is known, those of the print.
+    """
     from scipy.stats import chi2
 
     half = len(bundle.points) // 2

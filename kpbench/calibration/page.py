@@ -16,7 +16,8 @@ from kpbench.writing import write_file
 
 MARK = "kpbench.calibration-page/1"
 STYLE = """body{font:15px system-ui,sans-serif;max-width:70rem;margin:2rem auto;padding:0 1rem}
-table{border-collapse:collapse}td,th{padding:.15rem .7rem;text-align:right;border-bottom:1px solid #8884}th:first-child,td:first-child{text-align:left}
+table{border-collapse:collapse}td,th{padding:.15rem .7rem;text-align:right;border-bottom:1px solid #8884}
+th:first-child,td:first-child{text-align:left}
 svg{max-width:40rem;width:100%;height:auto;border:1px solid #8888}h2{margin-top:2rem}.bad{color:#c2410c}"""
 ARROW_TIMES = 200
 """Residuals are drawn this many times larger."""
