@@ -37,6 +37,8 @@ PIXEL_SIGMA = 0.005
 """Prior standard deviation of fx / fy - 1."""
 CENTRE_SIGMA = 0.1
 """Prior standard deviation of the principal point, in widths of the image."""
+LEAST_REST = 0.05
+"""Least part of what is known of a parameter that is taken to come from the other photographs."""
 LENS_SIGMA = {"brown": (1.0, 4.0, 0.05, 0.05, 8.0, 1.0, 4.0, 8.0, 0.05, 0.05, 0.05, 0.05), "fisheye": (0.5,) * 4}
 """Prior standard deviations of the coefficients of a lens."""
 
@@ -202,7 +204,7 @@ class _Problem:
         fx, fy = values[:2]
         row = np.zeros(len(values))
         row[:2] = np.array([1 / fx, -1 / fy]) / PIXEL_SIGMA
-        excess = np.log(fx / fy) / PIXEL_SIGMA if min(fx, fy) > 0 else np.inf
+        excess = np.log(fx / fy) / PIXEL_SIGMA
         hessian += np.outer(row, row)
         gradient -= row * excess
         return float((self.prior * off * off).sum() + excess**2)
@@ -248,8 +250,11 @@ def _minimise(problem: _Problem, state: _State, weights: list[Float]) -> tuple[_
 
 def _cost(problem: _Problem, state: _State, weights: list[Float]) -> float:
     size = len(problem.prior)
-    prior = problem.add_prior(state, np.zeros((size, size)), np.zeros(size))
-    return prior + sum(float((w * e * e).sum()) for w, e in zip(weights, problem.errors(state), strict=True))
+    if min(camera_values(state.camera)[:2]) <= 0:
+        return np.inf
+    with np.errstate(all="ignore"):  # a step that is much too long
+        prior = problem.add_prior(state, np.zeros((size, size)), np.zeros(size))
+        return prior + sum(float((w * e * e).sum()) for w, e in zip(weights, problem.errors(state), strict=True))
 
 
 @dataclass(frozen=True)
@@ -258,6 +263,8 @@ class _System:
 
     hessian: Float
     gradient: Float
+    photo_hessian: Float
+    """Contribution of each photograph to ``hessian``, of shape (photos, C, C)."""
     photo_gradient: Float
     """Contribution of each photograph to ``gradient``, of shape (photos, C)."""
     cross: Float
@@ -293,7 +300,7 @@ class _System:
 def _build(problem: _Problem, state: _State, weights: list[Float]) -> _System:
     size, photos = len(problem.prior), len(problem.points)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    photo_gradient = np.zeros((photos, size))
+    photo_hessian, photo_gradient = np.zeros((photos, size, size)), np.zeros((photos, size))
     cross, of_pose, pose_gradient = np.zeros((photos, size, 6)), np.zeros((photos, 6, 6)), np.zeros((photos, 6))
     cost = problem.add_prior(state, hessian, gradient)
     for n, p in enumerate(problem.points):
@@ -302,12 +309,13 @@ def _build(problem: _Problem, state: _State, weights: list[Float]) -> _System:
         error = np.einsum("nij,nj->ni", whiten, p.xy - seen.xy).ravel()
         shared = (whiten @ np.concatenate([seen.by_camera, seen.by_shape], axis=2)).reshape(-1, size)
         pose = (whiten @ seen.by_pose).reshape(-1, 6)
-        hessian += shared.T @ shared
+        photo_hessian[n] = shared.T @ shared
+        hessian += photo_hessian[n]
         photo_gradient[n] = shared.T @ error
         gradient += photo_gradient[n]
         cross[n], of_pose[n], pose_gradient[n] = shared.T @ pose, pose.T @ pose, pose.T @ error
         cost += float(error @ error)
-    return _System(hessian, gradient, photo_gradient, cross, of_pose, pose_gradient, cost)
+    return _System(hessian, gradient, photo_hessian, photo_gradient, cross, of_pose, pose_gradient, cost)
 
 
 def _estimate_covariance(system: _System, active: NDArray[np.bool_]) -> Float:
@@ -315,22 +323,28 @@ def _estimate_covariance(system: _System, active: NDArray[np.bool_]) -> Float:
 
     The inverse of the normal matrix is right if all errors are independent. Errors of one photograph are not, if lens
     or paper bend in a way that the model does not have. The gradients of the photographs then scatter more than they
-    should (the sandwich of P. J. Huber, 1967, with photographs as clusters). The covariance is scaled up by the mean
-    ratio.
+    should (clusters in the bias-reduced linearization of R. M. Bell and D. F. McCaffrey, *Survey Methodology* 28, 2002).
+    The covariance grows to their mean scatter, and to half of their scatter in each direction.
     """
     rows = np.flatnonzero(active)
     covariance = np.zeros((len(active), len(active)))
     if not len(rows):
         return covariance
     hessian, _, inverse = system.reduced(0.0)
-    found = np.linalg.pinv(hessian[np.ix_(rows, rows)], rcond=1e-14, hermitian=True)
+    hessian = hessian[np.ix_(rows, rows)]
+    scale = 1 / np.sqrt(np.diag(hessian))
+    values, vectors = np.linalg.eigh(hessian * scale[:, None] * scale)
+    root = scale[:, None] * vectors / np.sqrt(np.maximum(values, 1e-14 * values.max()))  # root rootᵀ is the inverse
     through = np.einsum("nij,njk->nik", system.cross, inverse)
     of_photos = (system.photo_gradient - np.einsum("nij,nj->ni", through, system.pose_gradient))[:, rows]
-    of_photos -= of_photos.mean(axis=0)
-    photos = len(of_photos)
-    excess = 1.0
-    if photos > len(rows):
-        scatter = np.einsum("ni,ij,nj->", of_photos, found, of_photos) / len(rows)
-        excess = max(1.0, float(scatter) * photos / (photos - 1))
-    covariance[np.ix_(rows, rows)] = found * excess
+    own = system.photo_hessian[:, rows][:, :, rows]
+    own = own - np.einsum("nij,nkj->nik", through[:, rows], system.cross[:, rows])
+    own = root.T @ own @ root
+    shares, axes = np.linalg.eigh(own)
+    unbiased = np.einsum("nij,nj,nkj->nik", axes, 1 / np.sqrt(np.maximum(1 - shares, LEAST_REST)), axes)
+    step = np.einsum("nij,nj->ni", unbiased, of_photos @ root)
+    scatter, directions = np.linalg.eigh(step.T @ step)
+    growth = np.maximum(scatter / 2, max(1.0, float(scatter.mean())))
+    root = root @ directions
+    covariance[np.ix_(rows, rows)] = root * growth @ root.T
     return covariance

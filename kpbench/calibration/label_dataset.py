@@ -162,7 +162,8 @@ def label(
     observed = observe_photos(photos, board, exclude=Path(out), progress=progress)
     observed, bundle, is_solved = _solve(observed, board, camera, text)
     halves = compare_halves(bundle, board_points_mm(board), solve_camera=is_solved)
-    _judge_halves(halves, len(bundle.points), text, force)
+    shown = len(bundle.points) + sum(o.reason in ("does-not-fit", "outliers") for o in observed)
+    _judge_halves(halves, shown, text, force)
     if abs(bundle.shape.ratio) > WRONG_RATIO:
         warnings.warn(
             f"{text}: the print is {1 + bundle.shape.ratio:.4f} times as wide as it should be for its height; was it "
