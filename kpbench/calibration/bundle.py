@@ -19,13 +19,13 @@ from kpbench.calibration.shape import SHAPE_NAMES, PrintShape
 from kpbench.geometry.camera import Camera
 from kpbench.types import Float
 
-ROUNDS, STEPS = 4, 25
+ROUNDS, MOST_STEPS = 4, 25
 """Number of times that weights are computed anew, and largest number of steps for each."""
 HUBER = 2.0
 """Whitened error, in standard deviations, from which a point's weight falls."""
 OUTLIER = 5.0
 """Whitened error, in standard deviations of its photograph, from which a point is left out."""
-LEAST_GAIN = 1e-7
+LEAST_STEP_GAIN = 1e-7
 """Relative gain of a step below which a round ends."""
 PHOTO_PRIOR = 20
 """Number of points with the noise of all photographs that count into the noise of each."""
@@ -231,7 +231,7 @@ def _minimise(problem: _Problem, state: _State, weights: list[Float]) -> tuple[_
     """Return the state of least cost, and the normal equations there."""
     damping = 1e-4
     system = _build(problem, state, weights)
-    for _ in range(STEPS):
+    for _ in range(MOST_STEPS):
         step, pose_steps = system.solve(damping, problem.active)
         moved = state.moved(step, pose_steps)
         cost = _cost(problem, moved, weights)
@@ -243,7 +243,7 @@ def _minimise(problem: _Problem, state: _State, weights: list[Float]) -> tuple[_
         gain = system.cost - cost
         state, damping = moved, max(damping / 10, 1e-9)
         system = _build(problem, state, weights)
-        if gain < LEAST_GAIN * cost:
+        if gain < LEAST_STEP_GAIN * cost:
             break
     return state, system
 
@@ -323,7 +323,7 @@ def _estimate_covariance(system: _System, active: NDArray[np.bool_]) -> Float:
 
     The inverse of the normal matrix is right if all errors are independent. Errors of one photograph are not, if lens
     or paper bend in a way that the model does not have. The gradients of the photographs then scatter more than they
-    should (clusters in the bias-reduced linearization of R. M. Bell and D. F. McCaffrey, *Survey Methodology* 28, 2002).
+    should (clusters in the bias-reduced linearization of R. M. Bell, D. F. McCaffrey, *Survey Methodology* 28, 2002).
     The covariance grows to their mean scatter, and to half of their scatter in each direction.
     """
     rows = np.flatnonzero(active)

@@ -10,8 +10,8 @@ import numpy as np
 
 from kpbench.calibration.bundle import Bundle
 from kpbench.calibration.observe import (
+    LEAST_CORNERS,
     LEAST_PATCHES,
-    LEAST_POINTS,
     Observed,
     board_points_mm,
     name_point,
@@ -202,7 +202,7 @@ def solve_and_reject(
     has_marks: bool = True,
 ) -> tuple[list[Observed], Bundle]:
     """Solve photographs, and again without those that do not fit."""
-    least = LEAST_POINTS if has_marks else LEAST_PATCHES
+    least = LEAST_CORNERS if has_marks else LEAST_PATCHES
     observed = [
         Observed(o.photo, o.points, "no-pose") if not o.reason and start_pose(o.points, board_mm, camera) is None else o
         for o in observed

@@ -16,7 +16,7 @@ import numpy as np
 
 from kpbench.types import Float, Int
 
-LENGTHS = (0.15, 0.4, 1.0)
+FIELD_LENGTHS = (0.15, 0.4, 1.0)
 """Lengths of the process, in diagonals of the board."""
 AMPLITUDES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
 """Variances of the process, in mean variances of the marks. 0 is considered, too."""
@@ -146,7 +146,7 @@ def fit_field(points_mm: Float, residual: Float, variance: Float, by_pose: Float
     size = float(np.hypot(*np.ptp(points_mm, axis=0)))
     scale_of_pose = np.sqrt((by_pose**2).mean(axis=(0, 1)))
     trend = (by_pose / scale_of_pose).reshape(2 * n, -1)
-    candidates = [(0.0, LENGTHS[0]), *((a, length) for a in AMPLITUDES for length in LENGTHS)]
+    candidates = [(0.0, FIELD_LENGTHS[0]), *((a, length) for a in AMPLITUDES for length in FIELD_LENGTHS)]
     found = list[tuple[float, _Model]]()
     for ratio, length in candidates:
         amplitude = ratio * float(variance.mean())

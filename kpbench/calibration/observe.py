@@ -16,7 +16,7 @@ from kpbench.detectors.interface import load_detector
 from kpbench.patches.board import Board
 from kpbench.types import Float, UInt8
 
-REASONS = {
+REJECTIONS = {
     "broken": "the file cannot be decoded",
     "other-size": "the photograph has another size than most",
     "no-marks": "no mark of the board was found",
@@ -31,7 +31,7 @@ REASONS = {
     "no-labels": "no patch lies among the marks that were found, or all are covered",
 }
 """Reason codes of rejected photographs, and what they mean."""
-LEAST_POINTS = 12
+LEAST_CORNERS = 12
 """Smallest number of X-corners of a photograph."""
 LEAST_PATCHES = 5
 """Smallest number of patches of a photograph, if the board has no marks."""
@@ -46,7 +46,7 @@ class Observed:
     photo : Photo
     points : BoardPoints
     reason : str
-        Reason code of a rejected photograph, one of :data:`REASONS`; "" for one that is used.
+        Reason code of a rejected photograph, one of :data:`REJECTIONS`; "" for one that is used.
     """
 
     photo: Photo
@@ -95,7 +95,7 @@ def observe_photos(
         If there are no photographs, or a file cannot be opened.
     """
     find = MarkFinder(board).find if board.references else _patch_finder(board, detector)
-    least = LEAST_POINTS if board.references else LEAST_PATCHES
+    least = LEAST_CORNERS if board.references else LEAST_PATCHES
     found = list[Observed]()
     for name, path in list_photos(source, exclude):
         photo, image = read_photo(name, path)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from kpbench.calibration.camera_solution import Calibration
-from kpbench.calibration.observe import REASONS
+from kpbench.calibration.observe import REJECTIONS
 from kpbench.calibration.projection import camera_values
 from kpbench.calibration.shape import SHAPE_NAMES
 from kpbench.text import escape_markup
@@ -99,7 +99,7 @@ def _photographs(calibration: Calibration) -> list[list[str]]:
     rows = list[list[str]]()
     for o in calibration.observed:
         if o.reason:
-            rows.append([o.photo.name, str(len(o.points)), "", "", "", f"rejected: {o.reason}, {REASONS[o.reason]}"])
+            rows.append([o.photo.name, str(len(o.points)), "", "", "", f"rejected: {o.reason}, {REJECTIONS[o.reason]}"])
             continue
         inlier, size = bundle.inlier[at], np.hypot(*bundle.residual[at].T)
         kept = size[inlier]

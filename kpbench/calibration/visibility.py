@@ -19,7 +19,7 @@ EXTENT = 0.94
 """Largest coordinate of the samples, in disc radii."""
 BLURS = (0.04, 0.12, 0.3)
 """Standard deviations of the blur of the ideal patch and of the image, in disc radii."""
-LEAST_LIKENESS = 0.6
+LEAST_PATCH_LIKENESS = 0.6
 """Least correlation of the image with the ideal patch."""
 WRONG = 0.4
 """Difference from the ideal patch, in parts of its contrast, from which a sample is covered."""
@@ -76,7 +76,7 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
             off = np.abs(centred - slope * wanted)
             best, contrast = likeness, max(slope, 0.0)
             wrong = float((off > WRONG * max(slope, 1e-6)).mean())
-    is_seen = best >= LEAST_LIKENESS and wrong <= MOST_WRONG
+    is_seen = best >= LEAST_PATCH_LIKENESS and wrong <= MOST_WRONG
     return Sight(is_seen, contrast, float(inside[disc].mean()))
 
 

@@ -18,20 +18,20 @@ from kpbench.types import Float, Float32, UInt8
 
 SMOOTHING_PX = 1.0
 """Standard deviation of the smoothing before the image is interpolated."""
-COARSE_PX = 2.0
+COARSE_SMOOTHING_PX = 2.0
 """Standard deviation of the smoothing of the first steps, which start up to some px beside the corner."""
-COARSE_STEPS, FINE_STEPS = 3, 5
+COARSE_CORNER_STEPS, FINE_CORNER_STEPS = 3, 5
 LONGEST_STEP_PX = 1.5
 """Longest step in each coordinate."""
 LEAST_RADIUS_PX, LARGEST_RADIUS_PX = 3, 12
 """Radius of the window about a corner."""
-LEAST_LIKENESS = 0.75
+LEAST_X_LIKENESS = 0.75
 """Least correlation between the image about a corner and the ideal X."""
 LARGEST_ASYMMETRY = 0.25
 """Largest standard deviation of what is not symmetric, in standard deviations of the image about the corner."""
 NOISE_AREA_PX = 20.0
 """Area over which smoothing and interpolation correlate the noise of pixels, about 4 pi sigma² of both."""
-LEAST_SIGMA_PX = 0.006
+LEAST_CORNER_SIGMA_PX = 0.006
 """Added to the standard deviation of a corner: interpolation and rounding of grey levels."""
 
 
@@ -79,7 +79,7 @@ def refine_x_corners(image: UInt8 | Float32, start_px: Float, A_board2image: Flo
     height, width = image.shape
     margin = radius + 2
     inside = (xy >= margin[:, None]).all(axis=1) & (xy < np.array([width, height]) - 1 - margin[:, None]).all(axis=1)
-    coarse, fine = (_Smoothed.of(image, sigma) for sigma in (COARSE_PX, SMOOTHING_PX))
+    coarse, fine = (_Smoothed.of(image, sigma) for sigma in (COARSE_SMOOTHING_PX, SMOOTHING_PX))
     for r in range(LEAST_RADIUS_PX, LARGEST_RADIUS_PX + 1):
         rows = np.flatnonzero((radius == r) & inside)
         if len(rows):
@@ -126,22 +126,22 @@ def _refine(
     offsets = grid[half & (distance <= radius)].astype(np.float64)
     weight = np.clip(radius + 1 - distance[half & (distance <= radius)], 0, 1.5) / 1.5
     xy = start.copy()
-    for step in range(COARSE_STEPS + FINE_STEPS):
-        delta, normal, residual, even = _solve(coarse if step < COARSE_STEPS else fine, xy, offsets, weight)
+    for step in range(COARSE_CORNER_STEPS + FINE_CORNER_STEPS):
+        delta, normal, residual, even = _solve(coarse if step < COARSE_CORNER_STEPS else fine, xy, offsets, weight)
         xy += np.clip(delta, -LONGEST_STEP_PX, LONGEST_STEP_PX)
     spread = np.sqrt(
         np.average((even - np.average(even, axis=1, weights=weight)[:, None]) ** 2, axis=1, weights=weight)
     )
     noise = np.sqrt(np.average(residual**2, axis=1, weights=weight) * len(weight) / max(len(weight) - 4, 1))
     covariance = noise[:, None, None] ** 2 * NOISE_AREA_PX * np.linalg.inv(normal)[:, :2, :2]
-    covariance = covariance / 2 + LEAST_SIGMA_PX**2 * np.eye(2)  # half of it: both points of a pair have noise
+    covariance = covariance / 2 + LEAST_CORNER_SIGMA_PX**2 * np.eye(2)  # half of it: both points of a pair have noise
     on_board = np.einsum("nij,kj->nki", np.linalg.inv(A_board2image), offsets)
     soft = np.tanh(on_board * np.linalg.svd(A_board2image, compute_uv=False)[:, None, 1:] / 1.5).prod(axis=2)
     soft -= np.average(soft, axis=1, weights=weight)[:, None]
     centred = even - np.average(even, axis=1, weights=weight)[:, None]
     scale = np.sqrt((weight * soft**2).sum(axis=1) * (weight * centred**2).sum(axis=1))
     likeness = np.divide((weight * soft * centred).sum(axis=1), scale, out=np.zeros(len(xy)), where=scale > 0)
-    is_found = (likeness > LEAST_LIKENESS) & (noise < LARGEST_ASYMMETRY * spread)
+    is_found = (likeness > LEAST_X_LIKENESS) & (noise < LARGEST_ASYMMETRY * spread)
     is_found &= (np.abs(delta).max(axis=1) < 0.05) & (np.hypot(*(xy - start).T) < max(4.0, radius))
     return xy, covariance, is_found
 

@@ -65,7 +65,7 @@ def calibrate(
 
     from kpbench.calibration.camera_solution import FEW_PHOTOS
     from kpbench.calibration.camera_solution import calibrate as solve
-    from kpbench.calibration.observe import REASONS
+    from kpbench.calibration.observe import REJECTIONS
     from kpbench.calibration.page import write_calibration_page
     from kpbench.calibration.photos import list_photos
     from kpbench.cli.progress import progress_bar
@@ -92,7 +92,7 @@ def calibrate(
     write_camera(out, result.camera, form)
     for o in result.observed:
         if o.reason:
-            print_warning(f"{o.photo.name}: rejected, {o.reason} ({REASONS[o.reason]})")
+            print_warning(f"{o.photo.name}: rejected, {o.reason} ({REJECTIONS[o.reason]})")
     used, halves = len(result.used), result.halves
     if used < FEW_PHOTOS:
         print_warning(f"{used} photographs; with fewer than {FEW_PHOTOS}, the stated uncertainty is itself uncertain")

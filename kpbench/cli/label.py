@@ -43,7 +43,7 @@ def label(
     """
     from kpbench.calibration.label_dataset import label as make_labels
     from kpbench.calibration.label_dataset import summarise_unlabelled
-    from kpbench.calibration.observe import REASONS
+    from kpbench.calibration.observe import REJECTIONS
     from kpbench.calibration.photos import list_photos
     from kpbench.cli.progress import progress_bar
     from kpbench.geometry.camera_file import read_camera
@@ -66,7 +66,7 @@ def label(
         )
     for o in result.observed:
         if o.reason:
-            print_warning(f"{o.photo.name}: rejected, {o.reason} ({REASONS[o.reason]})")
+            print_warning(f"{o.photo.name}: rejected, {o.reason} ({REJECTIONS[o.reason]})")
     config = result.dataset.config
     if turned := sum(photo["exif_turn"] != 1 for photo in config["photos"]):
         print_warning(

@@ -1,7 +1,9 @@
 """Labelled photographs: the truth, its stated errors, what is not labelled, and the gates."""
 
+import dataclasses
 import re
 import shutil
+from itertools import pairwise
 
 import board_photos
 import cv2
@@ -110,3 +112,29 @@ def test_a_board_without_marks_cannot_label(tmp_path):
 def test_folders_tell_condition_and_rung():
     assert name_condition("a/blur/7/x.png") == ("blur", 7.0)
     assert name_condition("7/x.png")[0] == "free"
+
+
+def test_score_knows_the_error_of_the_truth(labelled):
+    truth = labelled.dataset.truth
+    table = truth.keypoints.copy()
+    table["sigma_x"] = table["sigma_y"] = 0.4
+    table["sigma_x"][0] = 30.0  # as if a keypoint were known to 30 px only
+    rng = np.random.default_rng(0)
+    found, off = [], rng.normal(0, 0.5, (len(table), 2))
+    off[0] = 40.0, 0.0
+    for a, b in pairwise(truth.offsets):
+        xy = np.stack([table["x"][a:b], table["y"][a:b]], axis=1) + off[a:b]
+        own = np.tile(0.3**2 * np.eye(2), (b - a, 1, 1))
+        found.append(kpbench.Detections(xy, np.ones(b - a), table["patch_id"][a:b], covariance=own))
+    predictions = kpbench.Predictions.from_detections(found, truth.image_id)
+    scores = kpbench.score(dataclasses.replace(truth, keypoints=table), predictions)
+    assert scores.outcomes.matched.all()
+    assert scores.outcomes.truth_limited.tolist() == [True] + [False] * (len(table) - 1)
+    assert scores.to_dict()["dataset"]["truth"]["limited"] == 1
+    assert 1.4 < scores["nees"] < 2.7, "0.4 and 0.3 px make 0.5 px"
+    exact = kpbench.score(
+        dataclasses.replace(truth, keypoints=table[list(kpbench.KEYPOINT_DTYPE.names)].astype(kpbench.KEYPOINT_DTYPE)),
+        predictions,
+    )
+    assert not exact.outcomes.matched[0]
+    assert "truth" not in exact.to_dict()["dataset"]
