@@ -33,6 +33,8 @@ HALVES_P = 0.001
 """Probability below which the two halves contradict their stated uncertainty."""
 COEFFICIENTS = 5
 """Coefficients of the lens that is solved along."""
+COMMON_SIGMA_PX = 0.001
+"""Standard deviation of what moves all marks of a photograph alike, so that leaving out a mark does not show it."""
 SHARD_SIZE = 50
 WRONG_RATIO = 0.01
 """Deviation of the ratio of the print's scales, from which a warning tells it."""
@@ -213,12 +215,6 @@ def _solve(
 
 
 def _judge_halves(halves: Halves | None, photos: int, source: str, force: bool) -> None:
-    if photos < FEW_PHOTOS:
-        warnings.warn(
-            f"{source}: {photos} photographs; with fewer than {FEW_PHOTOS}, two halves tell little about the truth",
-            KpbenchWarning,
-            stacklevel=3,
-        )
     if halves is not None and halves.p < HALVES_P:
         text = (
             f"{source}: two halves of the photographs, solved apart, do not agree (chi-square {halves.chi2:.0f}, "
@@ -262,9 +258,11 @@ def _calibrate_sigma(labels: Sequence[PhotoLabels]) -> tuple[float, float]:
 
 
 def _scaled(keypoints: NDArray[Any], factor: float) -> NDArray[Any]:
+    """Return keypoints with all standard deviations times a factor, and ``COMMON_SIGMA_PX`` added."""
     table = keypoints.copy()
-    table["sigma_x"] *= factor
-    table["sigma_y"] *= factor
+    for name in ("sigma_x", "sigma_y"):
+        table[name] = np.hypot(factor * keypoints[name], COMMON_SIGMA_PX)
+    table["rho"] *= factor**2 * keypoints["sigma_x"] * keypoints["sigma_y"] / (table["sigma_x"] * table["sigma_y"])
     return table
 
 

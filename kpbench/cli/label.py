@@ -41,6 +41,7 @@ def label(
       kpbench label photos/ --board patches-print/truth.json --out labelled
       kpbench label photos/ --board patches-print/truth.json --camera camera.yaml --out labelled
     """
+    from kpbench.calibration.camera_solution import FEW_PHOTOS
     from kpbench.calibration.label_dataset import label as make_labels
     from kpbench.calibration.label_dataset import summarise_unlabelled
     from kpbench.calibration.observe import REJECTIONS
@@ -68,6 +69,9 @@ def label(
         if o.reason:
             print_warning(f"{o.photo.name}: rejected, {o.reason} ({REJECTIONS[o.reason]})")
     config = result.dataset.config
+    if len(result.dataset) < FEW_PHOTOS:
+        few = f"{len(result.dataset)} photographs; with fewer than {FEW_PHOTOS}, two halves tell little about the truth"
+        print_warning(few)
     if turned := sum(photo["exif_turn"] != 1 for photo in config["photos"]):
         print_warning(
             f"{turned} photographs are turned by their EXIF data; the dataset holds them as the sensor saw them"

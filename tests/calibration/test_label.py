@@ -17,8 +17,6 @@ from kpbench.calibration.conditions import name_condition
 from kpbench.calibration.label_dataset import _judge_halves
 from kpbench.errors import DataError, GateFailed, KpbenchWarning
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*two halves tell little")
-
 
 @pytest.fixture(scope="module")
 def labelled(photos, tmp_path_factory):
@@ -43,7 +41,7 @@ def test_the_truth_is_right_within_its_stated_error(labelled, photos):
     assert np.sqrt((error**2).mean()) < 0.006
     assert (table["patch_id"] == true["patch_id"]).all()
     nees = ((error / np.stack([table["sigma_x"], table["sigma_y"]], axis=1)) ** 2).sum(axis=1).mean()
-    assert 1.0 < nees < 4.0
+    assert 0.8 < nees < 4.0
     assert 0.5 < labelled.error_px / np.sqrt((error**2).mean()) < 2
     for name in ("radius_major", "radius_minor", "H_patch2image"):
         np.testing.assert_allclose(table[name], true[name], atol=0.02, rtol=1e-4)
