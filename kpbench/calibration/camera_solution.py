@@ -27,7 +27,7 @@ from kpbench.types import Float
 
 MOST_OUTLIERS = 0.3
 """Largest fraction of the points of a photograph that may be outliers."""
-MISFIT, LEAST_MISFIT_PX = 4.0, 0.5
+MISFIT, LEAST_MISFIT_PX = 5.0, 0.15
 """A photograph is rejected if its residuals are over ``MISFIT`` times those of most photographs, and over this, px."""
 LARGEST_RMS_PX = 1.5
 """Root mean square of the residuals of most photographs, px, over which no camera explains them."""
