@@ -69,6 +69,7 @@ ROOMS = {
     "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],
     "calibration": ["geometry", "patches", "boards", "detectors", "predictions", "dataset", "degrade"],
     "calibration": ["geometry", "patches", "boards", "render", "detectors", "dataset"],
+    "calibration": ["geometry", "patches", "boards", "printing", "render", "detectors", "dataset"],
     "training": [
         "geometry",
         "camera",

@@ -33,6 +33,7 @@ COMMANDS = {
     "detect": ("detect:detect", "Run a detector over a dataset or image files."),
     "track": ("track:track", "Follow a board through a film or a camera, and write its poses."),
     "calibrate": ("calibrate:calibrate", "Calibrate a camera from photographs of a board."),
+    "print-check": ("print_check:print_check", "Measure a print in photographs, and correct its sidecar."),
     "label": ("label:label", "Make a labelled dataset from photographs of a board."),
     "score": ("score:score", "Score a predictions file with the paper's metrics."),
     "compare": ("compare:compare", "Compare detectors on the same images, pair by pair."),
