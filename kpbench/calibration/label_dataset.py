@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from kpbench.calibration.bundle import Bundle
 from kpbench.calibration.camera_solution import FEW_PHOTOS, Halves, compare_halves, require_explained, solve_and_reject
-from kpbench.calibration.conditions import name_condition
+from kpbench.calibration.conditions import measure_condition, name_condition
 from kpbench.calibration.labels import PhotoLabels, label_photo
 from kpbench.calibration.observe import Observed, board_points_mm, observe_photos
 from kpbench.calibration.photos import as_grey, list_photos, read_photo
@@ -39,6 +39,7 @@ SHARD_SIZE = 50
 WRONG_RATIO = 0.01
 """Deviation of the ratio of the print's scales, from which a warning tells it."""
 Source = Literal["photographs", "simulated photographs"]
+Condition = Literal["folders", "scale", "pitch"]
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ def label(
     *,
     camera: Camera | None = None,
     source: Source = "photographs",
+    condition: Condition = "folders",
     force: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda photos: None,
@@ -132,6 +134,8 @@ def label(
         Camera of the photographs. Without it, a lens with five coefficients is solved along.
     source : {"photographs", "simulated photographs"}
         What reports say about the images.
+    condition : {"folders", "scale", "pitch"}
+        Where condition and rung come from: folders, the board's share of the image, or its tilt.
     force : bool
         Keep a dataset whose two halves do not agree. The dataset tells it.
     overwrite : bool
@@ -190,7 +194,7 @@ def label(
     config = _LabelConfig(
         tuple(paths[o.photo.name] for o in kept),
         tuple(keypoints),
-        tuple(name_condition(o.photo.name) for o in kept),
+        tuple(_condition(o, condition, board, bundle, observed) for o in kept),
         content,
     )
     dataset = generate(config, out, workers=1, overwrite=overwrite).dataset
@@ -248,6 +252,16 @@ def _label_all(
     if not labels:
         raise DataError(f"{next(iter(paths.values())).parent}: no patch can be labelled in any photograph")
     return done, kept, labels, has_colour
+
+
+def _condition(
+    o: Observed, condition: Condition, board: Board, bundle: Bundle, observed: Sequence[Observed]
+) -> tuple[str, float]:
+    if condition == "folders":
+        return name_condition(o.photo.name)
+    solved = [other.photo.name for other in observed if other.reason in ("", "no-labels")]
+    pose = bundle.poses[solved.index(o.photo.name)]
+    return measure_condition(condition, board, bundle.camera, pose, bundle.shape)
 
 
 def _calibrate_sigma(labels: Sequence[PhotoLabels]) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import click
 
@@ -20,6 +20,13 @@ from kpbench.cli.messages import echo, print_warning
 )
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Folder of the dataset.")
 @click.option("--simulated", is_flag=True, help="The photographs are simulated; reports say so.")
+@click.option(
+    "--condition",
+    type=click.Choice(["folders", "scale", "pitch"]),
+    default="folders",
+    show_default=True,
+    help="Condition and rung: from folders such as blur/7, or from the board's share of the image or its tilt.",
+)
 @click.option("--force", is_flag=True, help="Keep a dataset whose two halves do not agree.")
 @click.option("--overwrite", is_flag=True, help="Delete the dataset in the folder first.")
 def label(
@@ -28,6 +35,7 @@ def label(
     camera: Path | None,
     out: Path,
     simulated: bool,
+    condition: Literal["folders", "scale", "pitch"],
     force: bool,
     overwrite: bool,
 ) -> None:
@@ -61,6 +69,7 @@ def label(
             out,
             camera=None if camera is None else read_camera(camera),
             source="simulated photographs" if simulated else "photographs",
+            condition=condition,
             force=force,
             overwrite=overwrite,
             progress=progress,

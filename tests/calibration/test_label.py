@@ -12,9 +12,12 @@ import pytest
 from helpers import kpbench as run
 
 import kpbench
+from kpbench.calibration.bundle import PhotoPose
 from kpbench.calibration.camera_solution import Halves
-from kpbench.calibration.conditions import name_condition
+from kpbench.calibration.conditions import measure_condition, name_condition
 from kpbench.calibration.label_dataset import _judge_halves
+from kpbench.calibration.projection import turn
+from kpbench.calibration.shape import PrintShape
 from kpbench.errors import DataError, GateFailed, KpbenchWarning
 
 
@@ -136,3 +139,16 @@ def test_score_knows_the_error_of_the_truth(labelled):
     )
     assert not exact.outcomes.matched[0]
     assert "truth" not in exact.to_dict()["dataset"]
+
+
+def test_share_of_the_image_and_tilt_are_measured():
+    def measured(kind, depth_mm, tilt_deg=0.0):
+        pose = PhotoPose(turn(np.radians([tilt_deg, 0.0, 0.0])), np.array([0.0, 0.0, depth_mm]))
+        plain = dataclasses.replace(board_photos.CAMERA, distortion=(), principal_px=None)
+        return measure_condition(kind, board_photos.BOARD, plain, pose, PrintShape())
+
+    whole = board_photos.BOARD.side_x_mm * board_photos.BOARD.side_y_mm * 830 * 831 / (960 * 720)
+    assert measured("scale", np.sqrt(whole / 0.16)) == ("scale", 16.0)
+    assert measured("scale", np.sqrt(whole / 0.225))[0] == "free"
+    assert measured("pitch", 900.0, 31.0) == ("pitch", 30.0)
+    assert measured("pitch", 900.0, 35.0)[0] == "free"
