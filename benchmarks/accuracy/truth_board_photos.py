@@ -2,7 +2,7 @@
 
     python benchmarks/accuracy/truth_board_photos.py OUT --photos 100 --preset industrial --seed 1
 
-Writes `OUT/photos/*.png` (or .jpg with EXIF), `OUT/board/truth.json`, and `OUT/truth.npz`: the camera, and for each
+Writes `OUT/photos/*.png`, `OUT/board/truth.json`, and `OUT/truth.npz`: the camera, and for each
 photograph the true keypoints. With `--unmodelled`, the lens has a thin prism, the sheet is a saddle, and a third of
 the photographs has a rolling shutter in motion: effects that the solver does not model.
 """
@@ -10,7 +10,6 @@ the photographs has a rolling shutter in motion: effects that the solver does no
 import argparse
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 import kpbench
@@ -18,6 +17,7 @@ from kpbench.camera.paper import Cylinder, Saddle
 from kpbench.camera.preset import load_camera_preset
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
+from kpbench.images import encode_png
 from kpbench.render.background import procedural_background
 from kpbench.render.board_exposure import ExposedBoard
 from kpbench.render.board_projection import pose_board
@@ -93,7 +93,7 @@ def main():
     keypoints = []
     for n in range(args.photos):
         made = photograph_one(board, camera, bow, preset, [args.seed, n], args.area, args.unmodelled)
-        cv2.imwrite(str(args.out / "photos" / f"{n:04d}.png"), made.image)
+        (args.out / "photos" / f"{n:04d}.png").write_bytes(encode_png(made.image, "simulated"))
         keypoints.append(made.keypoints)
     names = [f"{n:04d}.png" for n in range(args.photos)]
     np.savez(

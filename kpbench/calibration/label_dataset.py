@@ -133,7 +133,7 @@ def label(
     camera : Camera, optional
         Camera of the photographs. Without it, a lens with five coefficients is solved along.
     source : {"photographs", "simulated photographs"}
-        What reports say about the images.
+        What reports say about the images. If kpbench wrote one of them, they are taken for simulated.
     condition : {"folders", "scale", "pitch"}
         Where condition and rung come from: folders, the board's share of the image, or its tilt.
     force : bool
@@ -178,6 +178,8 @@ def label(
             stacklevel=2,
         )
     observed, kept, labels, has_colour = _label_all(observed, bundle, board, paths, progress)
+    if any(o.photo.is_of_kpbench for o in kept):
+        source = "simulated photographs"
     factor, loo_px = _calibrate_sigma(labels)
     keypoints = [_scaled(found.keypoints, factor) for found in labels]
     sigma = np.concatenate([np.concatenate([table["sigma_x"], table["sigma_y"]]) for table in keypoints])

@@ -16,6 +16,7 @@ from kpbench.errors import DataError, system_reason
 from kpbench.files import IMAGE_SUFFIXES, image_files, read_bytes
 from kpbench.pixels import decode_pixels
 from kpbench.types import UInt8
+from kpbench.writing import HEAD_BYTES, TAIL_BYTES, kind_of
 
 EXIF_ORIENTATION = 274
 STANDARD_LUMINANCE_MEAN = 57.625
@@ -37,6 +38,8 @@ class Photo:
     jpeg_quality : int or None
         Quality of the JPEG file, from its tables; None for another form.
     sha256 : str
+    is_of_kpbench : bool
+        Whether kpbench wrote the file, so that it is taken for simulated.
 
     Examples
     --------
@@ -50,6 +53,7 @@ class Photo:
     exif_turn: int
     jpeg_quality: int | None
     sha256: str
+    is_of_kpbench: bool = False
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of the photograph in the configuration of a dataset."""
@@ -100,7 +104,8 @@ def read_photo(name: str, path: Path) -> tuple[Photo, UInt8 | None]:
     turn, quality = _read_head(data)
     if (image == image[..., :1]).all():
         image = np.ascontiguousarray(image[..., 0])
-    return Photo(name, (image.shape[1], image.shape[0]), turn, quality, digest), image
+    is_of_kpbench = kind_of(data[:HEAD_BYTES], data[-TAIL_BYTES:]) is not None
+    return Photo(name, (image.shape[1], image.shape[0]), turn, quality, digest, is_of_kpbench), image
 
 
 def as_grey(image: UInt8) -> UInt8:

@@ -19,6 +19,7 @@ from kpbench.calibration.label_dataset import _judge_halves
 from kpbench.calibration.projection import turn
 from kpbench.calibration.shape import PrintShape
 from kpbench.errors import DataError, GateFailed, KpbenchWarning
+from kpbench.images import encode_png
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +153,12 @@ def test_share_of_the_image_and_tilt_are_measured():
     assert measured("scale", np.sqrt(whole / 0.225))[0] == "free"
     assert measured("pitch", 900.0, 31.0) == ("pitch", 30.0)
     assert measured("pitch", 900.0, 35.0)[0] == "free"
+
+
+def test_images_that_kpbench_wrote_never_become_photographs(photos, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for name in ("01.png", "02.png"):
+        image = cv2.imread(str(photos[0] / name), cv2.IMREAD_GRAYSCALE)
+        (tmp_path / "photos" / name).write_bytes(encode_png(image, "simulated"))
+    result = kpbench.label(tmp_path / "photos", board_photos.BOARD, tmp_path / "set", camera=board_photos.CAMERA)
+    assert result.dataset.config["source"] == "simulated photographs"
