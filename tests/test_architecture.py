@@ -67,8 +67,6 @@ ROOMS = {
     "fitting": ["geometry", "patches"],
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
     "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],
-    "calibration": ["geometry", "patches", "boards", "detectors", "predictions", "dataset", "degrade"],
-    "calibration": ["geometry", "patches", "boards", "render", "detectors", "dataset"],
     "calibration": ["geometry", "patches", "boards", "printing", "render", "detectors", "dataset"],
     "training": [
         "geometry",
