@@ -23,7 +23,7 @@ ROUNDS, MOST_STEPS = 4, 25
 """Number of times that weights are computed anew, and largest number of steps for each."""
 HUBER = 2.0
 """Whitened error, in standard deviations, from which a point's weight falls."""
-OUTLIER = 5.0
+OUTLIER_SIGMAS = 5.0
 """Whitened error, in standard deviations of its photograph, from which a point is left out."""
 LEAST_STEP_GAIN = 1e-7
 """Relative gain of a step below which a round ends."""
@@ -217,7 +217,7 @@ def _weigh(error: list[Float], is_first: bool) -> tuple[list[NDArray[np.bool_]],
     everyone = float(np.median(own[count > 0])) if (count > 0).any() else 1.0
     noise = np.sqrt((count * own**2 + PHOTO_PRIOR * everyone**2) / (count + PHOTO_PRIOR))
     noise = np.maximum(noise, 1e-3)
-    keep = [e < OUTLIER * s for e, s in zip(error, noise, strict=True)]
+    keep = [e < OUTLIER_SIGMAS * s for e, s in zip(error, noise, strict=True)]
     weights = []
     for e, s, k in zip(error, noise, keep, strict=True):
         robust = np.minimum(1.0, HUBER * s / np.maximum(e, 1e-12))

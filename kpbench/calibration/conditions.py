@@ -13,7 +13,7 @@ from kpbench.calibration.shape import PrintShape
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
 
-FREE = "free"
+FREE_CONDITION = "free"
 """Condition of a photograph that belongs to no rung."""
 RUNGS = {"scale": (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0), "pitch": (0.0, 10.0, 20.0, 30.0, 40.0, 50.0, 60.0)}
 """Rungs of the suite ``paper-v1``: share of the image, %, and tilt, degrees."""
@@ -45,7 +45,7 @@ def name_condition(name: str) -> tuple[str, float]:
             rung = math.nan
         if math.isfinite(rung):
             return parts[-3], rung
-    return FREE, math.nan
+    return FREE_CONDITION, math.nan
 
 
 def measure_condition(kind: str, board: Board, camera: Camera, pose: PhotoPose, shape: PrintShape) -> tuple[str, float]:
@@ -72,4 +72,4 @@ def measure_condition(kind: str, board: Board, camera: Camera, pose: PhotoPose, 
         value = max(100 * area / (camera.width_px * camera.height_px), 1e-9)
         rung = min(RUNGS["scale"], key=lambda r: abs(math.log(r / value)))
         is_near = max(rung / value, value / rung) <= SCALE_TOLERANCE
-    return (kind, rung) if is_near else (FREE, math.nan)
+    return (kind, rung) if is_near else (FREE_CONDITION, math.nan)

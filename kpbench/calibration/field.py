@@ -22,7 +22,7 @@ AMPLITUDES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 1000.0)
 """Variances of the process, in mean variances of the marks. 0 is considered, too."""
 LEAST_WEIGHT = 0.02
 """Posterior weight, relative to the largest one, below which amplitude and length are left out."""
-LEAST_NOISE = 0.25
+LEAST_MARK_NOISE = 0.25
 """Least variance of the errors, in stated variances: more marks than a few tell no smaller one."""
 
 
@@ -159,7 +159,7 @@ def fit_field(points_mm: Float, residual: Float, variance: Float, by_pose: Float
         rest = (residual.ravel() - trend @ beta).reshape(n, 2)
         weighted = precision @ rest
         freedom = 2 * n - trend.shape[1]
-        scale = max(float((rest * weighted).sum()) / freedom, LEAST_NOISE)
+        scale = max(float((rest * weighted).sum()) / freedom, LEAST_MARK_NOISE)
         likelihood = -float(np.linalg.slogdet(K)[1]) - 0.5 * float(np.linalg.slogdet(information)[1])
         likelihood -= 0.5 * freedom * np.log(scale)
         model = _Model(

@@ -13,11 +13,11 @@ from kpbench.geometry.homography import project
 from kpbench.patches.design import Patch
 from kpbench.types import Float, UInt8
 
-GRID = 41
+DISC_GRID = 41
 """Samples along the diameter of a disc."""
 EXTENT = 0.94
 """Largest coordinate of the samples, in disc radii."""
-BLURS = (0.04, 0.12, 0.3)
+DISC_BLURS = (0.04, 0.12, 0.3)
 """Standard deviations of the blur of the ideal patch and of the image, in disc radii."""
 LEAST_PATCH_LIKENESS = 0.6
 """Least correlation of the image with the ideal patch."""
@@ -57,7 +57,7 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
     """
     uv, ideal, disc = _ideal(patch)
     height, width = image.shape
-    xy = project(H_patch2image, uv.reshape(-1, 2)).astype(np.float32).reshape(GRID, GRID, 2)
+    xy = project(H_patch2image, uv.reshape(-1, 2)).astype(np.float32).reshape(DISC_GRID, DISC_GRID, 2)
     inside = np.asarray(((xy >= -0.5) & (xy < np.array([width, height]) - 0.5)).all(axis=2), np.bool_)
     seen = cv2.remap(
         np.asarray(image, np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -66,7 +66,7 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
     if use.sum() < 20:
         return Sight(False, 0.0, float(inside[disc].mean()))
     best, contrast, wrong = -1.0, 0.0, 1.0
-    for blur, expected in zip(BLURS, ideal, strict=True):
+    for blur, expected in zip(DISC_BLURS, ideal, strict=True):
         smooth = _blur(np.asarray(seen, np.float64), blur)[use]
         centred, wanted = smooth - smooth.mean(), expected[use] - expected[use].mean()
         power = float(wanted @ wanted)
@@ -83,14 +83,14 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
 @lru_cache(maxsize=64)
 def _ideal(patch: Patch) -> tuple[Float, tuple[Float, ...], NDArray[np.bool_]]:
     """Return the samples in the patch frame, the whiteness of the blurred patch, and which samples lie in the disc."""
-    axis = np.linspace(-EXTENT, EXTENT, GRID)
+    axis = np.linspace(-EXTENT, EXTENT, DISC_GRID)
     uv = np.stack(np.meshgrid(axis, axis), axis=-1)
     step = axis[1] - axis[0]
     parts = [(uv + np.array([dx, dy]) * step) for dx in (-0.25, 0.25) for dy in (-0.25, 0.25)]
     white = np.mean([~patch.is_black(part) for part in parts], axis=0)
-    return uv, tuple(_blur(white, blur) for blur in BLURS), np.hypot(uv[..., 0], uv[..., 1]) <= EXTENT
+    return uv, tuple(_blur(white, blur) for blur in DISC_BLURS), np.hypot(uv[..., 0], uv[..., 1]) <= EXTENT
 
 
 def _blur(values: Float, sigma: float) -> Float:
-    step = 2 * EXTENT / (GRID - 1)
+    step = 2 * EXTENT / (DISC_GRID - 1)
     return np.asarray(cv2.GaussianBlur(values, (0, 0), sigma / step, borderType=cv2.BORDER_REPLICATE), np.float64)

@@ -23,7 +23,7 @@ COARSE_SMOOTHING_PX = 2.0
 COARSE_CORNER_STEPS, FINE_CORNER_STEPS = 3, 5
 LONGEST_STEP_PX = 1.5
 """Longest step in each coordinate."""
-LEAST_RADIUS_PX, LARGEST_RADIUS_PX = 3, 12
+LEAST_WINDOW_PX, LARGEST_WINDOW_PX = 3, 12
 """Radius of the window about a corner."""
 LEAST_X_LIKENESS = 0.75
 """Least correlation between the image about a corner and the ideal X."""
@@ -75,12 +75,12 @@ def refine_x_corners(image: UInt8 | Float32, start_px: Float, A_board2image: Flo
     if not n:
         return XCorners(xy, covariance, is_found)
     least_scale = np.linalg.svd(A_board2image, compute_uv=False)[:, 1]
-    radius = np.floor(np.clip(reach_mm * least_scale - 1.0, 0, LARGEST_RADIUS_PX)).astype(int)
+    radius = np.floor(np.clip(reach_mm * least_scale - 1.0, 0, LARGEST_WINDOW_PX)).astype(int)
     height, width = image.shape
     margin = radius + 2
     inside = (xy >= margin[:, None]).all(axis=1) & (xy < np.array([width, height]) - 1 - margin[:, None]).all(axis=1)
     coarse, fine = (_Smoothed.of(image, sigma) for sigma in (COARSE_SMOOTHING_PX, SMOOTHING_PX))
-    for r in range(LEAST_RADIUS_PX, LARGEST_RADIUS_PX + 1):
+    for r in range(LEAST_WINDOW_PX, LARGEST_WINDOW_PX + 1):
         rows = np.flatnonzero((radius == r) & inside)
         if len(rows):
             xy[rows], covariance[rows], is_found[rows] = _refine(coarse, fine, xy[rows], A_board2image[rows], r)
