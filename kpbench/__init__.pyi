@@ -6,6 +6,9 @@ from .boards.matching import BoardMatch as BoardMatch
 from .boards.matching import find_board as find_board
 from .boards.pose import BoardPose as BoardPose
 from .boards.pose import estimate_pose as estimate_pose
+from .calibration.camera_solution import Calibration as Calibration
+from .calibration.camera_solution import calibrate as calibrate
+from .calibration.label_dataset import label as label
 from .dataset.export import export_dataset as export_dataset
 from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
@@ -30,6 +33,8 @@ from .patches.board_file import load_board as load_board
 from .patches.design import Patch as Patch
 from .patches.design import load_patches as load_patches
 from .patches.design import shipped_patches as shipped_patches
+from .patches.reference_boards import truth_board as truth_board
+from .patches.reference_boards import with_reference as with_reference
 from .predictions.files import read_predictions as read_predictions
 from .predictions.files import write_predictions as write_predictions
 from .printing.prints import print_boards as print_boards
@@ -46,6 +51,7 @@ from .tracking.scores import score_poses as score_poses
 from .tracking.tracker import TrackedPose as TrackedPose
 from .tracking.tracker import Tracker as Tracker
 from .types import KEYPOINT_DTYPE as KEYPOINT_DTYPE
+from .types import LABELLED_KEYPOINT_DTYPE as LABELLED_KEYPOINT_DTYPE
 from .types import Detections as Detections
 from .types import Predictions as Predictions
 from .types import Truth as Truth

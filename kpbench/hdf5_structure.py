@@ -39,8 +39,8 @@ class Column:
 
     Attributes
     ----------
-    dtype : str or dtype
-        The exact type; or the accepted kinds of NumPy, such as "iu".
+    dtype : str or tuple of dtype
+        The exact types; or the accepted kinds of NumPy, such as "iu".
     filters : tuple of str
         Filters that may be in use, each at most once and in this order.
     ndim : tuple of int
@@ -111,13 +111,13 @@ def _check_column(name: str, data: Any, column: Column, file_bytes: int) -> None
         raise StructureError(f"{name} is not plain data stored in this file")
     kind, dtype, shape = data.get_type(), data.dtype, data.shape
     if not isinstance(column.dtype, str):
-        is_expected = _hdf5_type(column.dtype).equal(kind)
+        is_expected = any(_hdf5_type(accepted).equal(kind) for accepted in column.dtype)
     elif kind.get_class() == h5py.h5t.STRING:
         is_expected = "S" in column.dtype and not kind.is_variable_str()
     else:
         is_expected = dtype.kind in column.dtype and h5py.h5t.py_create(dtype).equal(kind)
     if not is_expected or len(shape) not in column.ndim:
-        expected = "numbers or text of fixed length" if isinstance(column.dtype, str) else column.dtype
+        expected = "numbers or text of fixed length" if isinstance(column.dtype, str) else column.dtype[0]
         ndim = " or ".join(map(str, column.ndim))
         raise StructureError(f"{name} is {dtype} of shape {shape}, expected {expected} of {ndim} dimensions")
     numbers = [plan.get_filter(n)[0] for n in range(plan.get_nfilters())]

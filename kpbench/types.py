@@ -39,6 +39,15 @@ KEYPOINT_DTYPE = np.dtype(
     ]
 )
 """Record type of one true keypoint, as in ``/keypoints`` of a shard."""
+LABELLED_KEYPOINT_DTYPE = np.dtype(
+    [
+        *KEYPOINT_DTYPE.descr,
+        ("sigma_x", "<f4"),  # px, standard deviation of the error of x
+        ("sigma_y", "<f4"),
+        ("rho", "<f4"),  # correlation of the errors of x and y
+    ]
+)
+"""Record type of one keypoint of a labelled photograph, whose truth has an error."""
 
 
 @dataclass(frozen=True)

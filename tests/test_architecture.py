@@ -67,6 +67,7 @@ ROOMS = {
     "fitting": ["geometry", "patches"],
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
     "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],
+    "calibration": ["geometry", "patches", "boards", "printing", "render", "detectors", "dataset"],
     "training": [
         "geometry",
         "camera",

@@ -29,12 +29,12 @@ from kpbench.cli.options import Finite, Two
     "--diameter-mm",
     type=Finite(0.1, 5000),
     metavar="MM",
-    help="Diameter of a disc, without rim and quiet zone. Default: 30. The side of a hexagon board is MM / 0.16.",
+    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board. The side of a "
+    "hexagon board is MM / 0.16.",
 )
 @click.option("--page", default="a4", show_default=True, help="Page: a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
 @click.option("--landscape", is_flag=True, help="Use the page in landscape format.")
 @click.option("--dpi", type=click.IntRange(36, 4800), default=600, show_default=True, help="Resolution of the PNG.")
-@click.option("--board", metavar="hexagon|grid|FILE.toml", help="Print a board instead of patches to cut out.")
 @click.option(
     "--target",
     "targets",
@@ -42,6 +42,8 @@ from kpbench.cli.options import Finite, Two
     multiple=True,
     help="Also write the board for this program, into the subfolder targets; repeatable. Needs --board.",
 )
+@click.option("--board", metavar="hexagon|grid|truth|FILE.toml", help="Print a board instead of patches to cut out.")
+@click.option("--reference", is_flag=True, help="Put a ring of reference marks around the board.")
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
     "--design",
@@ -84,6 +86,7 @@ def render_patches(
     dpi: int,
     board: str | None,
     targets: tuple[str, ...],
+    reference: bool,
     tile: bool,
     designs: tuple[Path, ...],
     chosen: tuple[str, ...],
@@ -105,11 +108,13 @@ def render_patches(
       kpbench render-patches --board hexagon --patch 0
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
       kpbench render-patches --board grid --target opencv --target kalibr
+      kpbench render-patches --board truth --pdf
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch, load_boards
     from kpbench.patches.design import load_patches, shipped_patches
+    from kpbench.patches.reference_boards import with_reference
     from kpbench.patches.symmetry import pose_problem
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
@@ -126,6 +131,8 @@ def render_patches(
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
     boards = load_boards(board, patches if designs or chosen else None, diameter_mm) if board is not None else ()
+    if reference:
+        boards = tuple(map(with_reference, boards))
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
     layout: dict[str, Any] = {"page": parse_page_format(page, landscape, not no_labels, mirror, invert), "dpi": dpi}
     with progress_bar(len(boards) or 1, "print", unit="sheet", shown=png) as progress:
@@ -150,7 +157,9 @@ def _check_usage(given: set[str], board: str | None) -> None:
         raise click.UsageError("--target describes a board; give --board.")
     if board is None and "tile" in given:
         raise click.UsageError("--tile spreads a board; give --board.")
+    if board is None and "reference" in given:
+        raise click.UsageError("--reference adds marks to a board; give --board.")
     if board is not None and "copies" in given:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
-    if board not in (None, "hexagon", "grid") and "chosen" in given:
+    if board not in (None, "hexagon", "grid", "truth") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")

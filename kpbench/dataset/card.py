@@ -76,6 +76,8 @@ def dataset_facts(dataset: Dataset) -> dict[str, str]:
     image, config, keypoints = dataset.image(0), dataset.config, dataset.truth.keypoints
     size = sum(shard.bytes for shard in dataset.shards)
     sources = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
+    if "source" in config:
+        sources = [str(config["source"])]
     if "deteriorate" in config:
         sources.append(f"deterioration {config['deteriorate']}")
     if "limits" in config:
@@ -89,7 +91,7 @@ def dataset_facts(dataset: Dataset) -> dict[str, str]:
         "fingerprint": dataset.fingerprint,
         "images": f"{len(dataset)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}",
         "on disk": f"{size / 1e6:.1f} MB in {len(dataset.shards)} shards, {size / len(dataset) / 1e3:.1f} kB an image",
-        "made from": ", ".join([f"seed {config.get('seed')}", *sources]),
+        "made from": ", ".join([*([f"seed {config['seed']}"] if "seed" in config else []), *sources]),
         "designs": ", ".join(designs) or "n/a",
         "keypoints": f"{len(keypoints)}",
     }

@@ -23,23 +23,23 @@ from kpbench.errors import DataError, system_reason
 from kpbench.files import encode_utf8
 from kpbench.hdf5 import open_hdf5
 from kpbench.hdf5_structure import Column, Layout
-from kpbench.types import KEYPOINT_DTYPE, UInt8
+from kpbench.types import KEYPOINT_DTYPE, LABELLED_KEYPOINT_DTYPE, UInt8
 
 DATASET_SCHEMA = "kpbench.dataset/1"
 DEFLATE_LEVEL = 1
 """Level of libdeflate, which always gives the same bytes for the same input. ISA-L, zlib-ng and zlib-rs may not."""
 LEAST_SHRINKING = 0.75
 """Images that level 1 shrinks to more than this fraction are stored: shrinking noise takes longer than all else."""
-_INT, _FLOAT = Column(np.dtype("<i8"), ("fletcher32",)), Column(np.dtype("<f8"), ("fletcher32",))
+_INT, _FLOAT = Column((np.dtype("<i8"),), ("fletcher32",)), Column((np.dtype("<f8"),), ("fletcher32",))
 _TEXT = Column("S", ("gzip", "fletcher32"))
 SHARD_COLUMNS = {
-    "images": Column(np.dtype("u1"), ("gzip",), ndim=(3, 4), is_large=True),
+    "images": Column((np.dtype("u1"),), ("gzip",), ndim=(3, 4), is_large=True),
     "image_id": _INT,
     "scene_id": _INT,
     "condition": _TEXT,
     "rung": _FLOAT,
     "offsets": _INT,
-    "keypoints": Column(KEYPOINT_DTYPE, ("fletcher32",)),
+    "keypoints": Column((KEYPOINT_DTYPE, LABELLED_KEYPOINT_DTYPE), ("fletcher32",)),
     "degradations": _TEXT,
     "background": _TEXT,
 }
@@ -56,7 +56,7 @@ class Sample:
     image_id : int
     image : ndarray of shape (H, W) or (H, W, 3), uint8
         Grey or RGB.
-    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE
+    keypoints : ndarray of shape (n,), KEYPOINT_DTYPE or LABELLED_KEYPOINT_DTYPE
     effects : list of dict
         Records of the degradations, in order.
     background : str
@@ -144,10 +144,17 @@ def encode_shard(
         write_texts("condition", [sample.condition for sample in written])
         write_column("rung", np.array([sample.rung for sample in written], "<f8"))
         write_column("offsets", np.cumsum([0, *(len(sample.keypoints) for sample in written)], dtype="<i8"))
-        write_column("keypoints", np.concatenate([sample.keypoints for sample in written]).astype(KEYPOINT_DTYPE))
+        write_column("keypoints", _join_keypoints(written))
         write_texts("degradations", [canonical_json(sample.effects) for sample in written])
         write_texts("background", [sample.background for sample in written])
     return buffer.getbuffer()
+
+
+def _join_keypoints(samples: Sequence[Sample]) -> NDArray[Any]:
+    """Return the keypoints of all samples as one table, with the errors of the truth if all samples have some."""
+    is_labelled = all(sample.keypoints.dtype == LABELLED_KEYPOINT_DTYPE for sample in samples)
+    table = np.concatenate([sample.keypoints for sample in samples])
+    return table.astype(LABELLED_KEYPOINT_DTYPE if is_labelled else KEYPOINT_DTYPE)
 
 
 def _write_images(file: Any, samples: Iterable[Sample], count: int) -> list[Sample]:

@@ -11,6 +11,9 @@ from .design import Patch as Patch
 from .design import SemiCircle as SemiCircle
 from .design import load_patches as load_patches
 from .design import shipped_patches as shipped_patches
+from .reference import ReferenceMark as ReferenceMark
+from .reference_boards import truth_board as truth_board
+from .reference_boards import with_reference as with_reference
 from .symmetry import board_turns_deg as board_turns_deg
 from .symmetry import pose_problem as pose_problem
 from .tag_boards import TagBoard as TagBoard

@@ -19,6 +19,7 @@ from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg, flatten
 from kpbench.geometry.spread import spread
 from kpbench.patches.design import Patch, unit_polygons
+from kpbench.patches.reference import ReferenceMark
 from kpbench.types import Float, Int
 
 # In the paper, a disc is 16 px wide if its board covers 0.5 % of a 1624 x 1240 px image. A square board then has a side
@@ -141,12 +142,14 @@ class Board:
         Width and height.
     keypoints : tuple of BoardKeypoint
         At least one keypoint.
+    references : tuple of ReferenceMark
+        Marks that tell the pose of the board without its patches.
 
     Raises
     ------
     DesignError
-        If the board has no keypoint, a patch reaches over the edge of the board, two patches overlap, or two different
-        designs share an id.
+        If the board has no keypoint, a patch or a mark reaches over the edge of the board, two patches or marks
+        overlap, two marks have one id, or two different designs share an id.
 
     Examples
     --------
@@ -160,6 +163,7 @@ class Board:
     side_x_mm: float
     side_y_mm: float
     keypoints: tuple[BoardKeypoint, ...]
+    references: tuple[ReferenceMark, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.keypoints:
@@ -184,6 +188,29 @@ class Board:
         for k in self.keypoints:
             if seen.setdefault(k.patch.patch_id, k.patch).digest != k.patch.digest:
                 raise DesignError(f"board {self.name!r}: two designs share the id {k.patch.patch_id}")
+        if self.references:
+            self._check_references(np.stack([x, y], axis=1), extent)
+
+    def _check_references(self, centres: Float, extent: Float) -> None:
+        place = np.array([(m.x_mm, m.y_mm) for m in self.references])
+        half = np.array([(m.width_mm, m.height_mm) for m in self.references]) / 2
+        ids = [m.mark_id for m in self.references]
+        if len({m.dictionary for m in self.references}) > 1 or len({*ids}) < len(ids):
+            raise DesignError(f"board {self.name!r}: reference marks need one dictionary and different ids")
+        side = np.array([self.side_x_mm, self.side_y_mm]) / 2
+        between = np.abs(place[:, None] - place) - half[:, None] - half
+        overlap = (between < -TOUCHING_MM).all(axis=2) & ~np.eye(len(ids), dtype=bool)
+        to_patch = (
+            np.hypot(*np.maximum(np.abs(place[:, None] - centres) - half[:, None], 0).transpose(2, 0, 1)) - extent
+        )
+        bad = (np.abs(place) + half > side + TOUCHING_MM).any(axis=1) | overlap.any(axis=1)
+        bad |= (to_patch < -TOUCHING_MM).any(axis=1)
+        if bad.any():
+            mark = self.references[int(np.argmax(bad))]
+            raise DesignError(
+                f"board {self.name!r}: reference mark {mark.mark_id} at ({mark.x_mm:g}, {mark.y_mm:g}) mm overlaps "
+                "a patch, another mark or the edge of the board"
+            )
 
     @property
     def patches(self) -> tuple[Patch, ...]:
@@ -233,7 +260,8 @@ class Board:
         Returns
         -------
         parts : list of lists of ndarray of shape (N, 2)
-            Polygons of each part of the ink. The ink of each patch is one part. Parts do not overlap.
+            Polygons of each part of the ink. The ink of each patch is one part, and then that of each reference
+            mark. Parts do not overlap.
         discs : list of lists of ndarray of shape (N, 2)
             Polygons of each whole patch, rim and quiet zone included.
         """
@@ -246,18 +274,22 @@ class Board:
                 black = _spread_polygons(k.patch, tolerance, ink_gain)
             parts.append([project(k.H_patch2board, polygon) for polygon in black])
             discs.append([project(k.H_patch2board, polygon) for polygon in disc])
-        return parts, discs
+        radius_mm = max(k.diameter_mm for k in self.keypoints) / 2
+        return parts + [mark.outlines(ink_gain * radius_mm) for mark in self.references], discs
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the board's size, and of each patch's design, place, rotation and diameter.
+        """SHA-256 of the board's size, of each patch's design, place, rotation and diameter, and of reference marks.
 
         Lengths are rounded to 1 nm, and rotations to 1e-6 degrees. Names are not hashed.
         """
         lengths: list[tuple[float, ...]] = [(self.side_x_mm, self.side_y_mm)]
         lengths += [(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints]
         patches = [(k.patch.patch_id, k.patch.digest) for k in self.keypoints]
-        content = ([[round(v, 6) + 0.0 for v in row] for row in lengths], patches)
+        content: tuple[object, ...] = ([[round(v, 6) + 0.0 for v in row] for row in lengths], patches)
+        if self.references:
+            corners = [(m.dictionary, m.mark_id, (m.corners_mm.round(6) + 0.0).tolist()) for m in self.references]
+            content = (*content, corners)
         return hashlib.sha256(repr(content).encode()).hexdigest()
 
 

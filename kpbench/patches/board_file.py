@@ -10,6 +10,7 @@ from kpbench.errors import DesignError
 from kpbench.patches.board import HEXAGON_DIAMETER, Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.board_sidecar import read_board_sidecar
 from kpbench.patches.design import Patch, load_patches, shipped_patches
+from kpbench.patches.reference_boards import TRUTH_DIAMETER_MM, truth_board
 from kpbench.toml import TomlTable, name_source, read_toml
 
 BOARD_FILE_SCHEMA = "kpbench.board-design/1"
@@ -100,12 +101,12 @@ def load_boards(
     Parameters
     ----------
     name : str or Path
-        "hexagon" for a hexagon board per design, "grid" for one grid of 4 rows and 3 columns, or a file as for
-        :func:`kpbench.load_board`.
+        "hexagon" for a hexagon board per design, "grid" for one grid of 4 rows and 3 columns, "truth" for
+        :func:`kpbench.truth_board`, or a file as for :func:`kpbench.load_board`.
     patches : sequence of Patch, optional
         Designs on the boards. Default: the shipped designs, or as in the file.
     diameter_mm : float, optional
-        Diameter of the discs. Default: 30, or as in the file.
+        Diameter of the discs. Default: 30, or 24 for the truth board, or as in the file.
 
     Raises
     ------
@@ -121,10 +122,12 @@ def load_boards(
     designs, diameter = patches or shipped_patches(), diameter_mm or DEFAULT_DIAMETER_MM
     if name == "hexagon":
         return tuple(hexagon_board(patch, diameter / HEXAGON_DIAMETER) for patch in designs)
+    if name == "truth":
+        return (truth_board(designs, diameter_mm or TRUTH_DIAMETER_MM),)
     if name == "grid":
         return (grid_board(designs, 4, 3, diameter, GRID_PITCH * diameter),)
     if not Path(name).is_file():
-        raise DesignError(f"{name}: no such file, expected hexagon, grid or a board's file")
+        raise DesignError(f"{name}: no such file, expected hexagon, grid, truth or a board's file")
     return (load_board(name, patches, diameter_mm),)
 
 

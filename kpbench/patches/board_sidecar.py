@@ -6,15 +6,20 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from kpbench.errors import DesignError
 from kpbench.files import load_json, read_text
 from kpbench.patches.board import Board, BoardKeypoint
 from kpbench.patches.design import Patch, shipped_patches
+from kpbench.patches.reference import CORNER_PLACES, REFERENCE_DICTIONARIES, REFERENCE_KIND, ReferenceMark
 from kpbench.toml import TomlTable, name_source
 
 BOARD_SCHEMA = "kpbench.board/1"
 """Name and version of the format of the sidecars of boards."""
 LARGEST_MM = 100_000.0
+LARGEST_CORNER_ERROR_MM = 1e-5
+"""Largest deviation of the four corners of a mark from a rectangle: files hold lengths rounded to 1 nm."""
 
 
 def read_board_sidecar(path: str | Path, patches: Sequence[Patch] | None = None) -> Board:
@@ -65,7 +70,24 @@ def _parse(content: dict[str, Any], patches: Sequence[Patch]) -> Board:
         )
         keypoints.append(BoardKeypoint(designs[patch_id], x_mm, y_mm, rotate_deg, diameter_mm))
     side_x_mm, side_y_mm = table.numbers("side_mm", 0.1, LARGEST_MM, 2)
-    return Board(table.name(), side_x_mm, side_y_mm, tuple(keypoints))
+    references = tuple(map(_parse_mark, _tables(table, "references"))) if "references" in table else ()
+    return Board(table.name(), side_x_mm, side_y_mm, tuple(keypoints), references)
+
+
+def _parse_mark(entry: TomlTable) -> ReferenceMark:
+    entry.choice("kind", (REFERENCE_KIND,))
+    dictionary = entry.choice("dictionary", tuple(REFERENCE_DICTIONARIES))
+    mark_id = entry.whole_number("id", 0, REFERENCE_DICTIONARIES[dictionary] - 1)
+    try:
+        corners = np.array(entry.values.get("corners_mm"), np.float64)
+        (x, y), size = corners.mean(axis=0).tolist(), np.ptp(corners, axis=0) / np.ptp(CORNER_PLACES, axis=0)
+        mark = ReferenceMark(dictionary, mark_id, x, y, float(size[0]), float(size[1]))
+        fits = size.min() > 0 and np.abs(mark.corners_mm - corners).max() < LARGEST_CORNER_ERROR_MM
+    except (TypeError, ValueError):
+        fits = False
+    if not fits:
+        raise entry.problem("corners_mm", "four points [x, y] of a rectangle, clockwise from the top left")
+    return mark
 
 
 def _tables(table: TomlTable, key: str) -> list[TomlTable]:

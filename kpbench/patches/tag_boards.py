@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.geometry.outline import Line, Region, circle, flatten
-from kpbench.geometry.spread import spread
+from kpbench.geometry.outline import circle, flatten
 from kpbench.patches.board import HEXAGON_DIAMETER
+from kpbench.patches.modules import module_region
 from kpbench.types import Float
 
 TAG_BOARDS = ("aruco", "apriltag", "charuco")
@@ -102,7 +102,7 @@ class TagBoard:
             gain = ink_gain * self.keypoints[0].diameter_mm / 2 / module_mm
             tolerance = 1e-3 * self.keypoints[0].diameter_mm / 2 / float(radius_px.max()) / module_mm
             modules = tuple(map(tuple, self.black.tolist()))
-            ink = [module_mm * (polygon - middle) for polygon in flatten(_spread_modules(modules, gain), tolerance)]
+            ink = [module_mm * (polygon - middle) for polygon in flatten(module_region(modules, gain), tolerance)]
         discs = []
         for k, radius in zip(self.keypoints, radius_px, strict=True):
             mm = k.diameter_mm / 2
@@ -117,31 +117,6 @@ class TagBoard:
             "modules": ["".join(" #"[int(black)] for black in row) for row in self.black],
             "keypoints": [[k.patch_id, k.x_mm, k.y_mm, k.diameter_mm] for k in self.keypoints],
         }
-
-
-@lru_cache(maxsize=16)
-def _spread_modules(black: tuple[tuple[bool, ...], ...], gain: float) -> Region:
-    """Return the outline of black modules whose edges all move outwards by ``gain``; lengths are in modules."""
-    edges: dict[tuple[int, int], list[tuple[int, int]]] = {}  # end points of the edges, by their start points
-
-    def add(start: tuple[int, int], end: tuple[int, int]) -> None:
-        if start in edges.get(end, []):  # two black neighbours share this edge
-            edges[end].remove(start)
-        else:
-            edges.setdefault(start, []).append(end)
-
-    for y, x in np.argwhere(np.array(black)).tolist():
-        corners = [(x, y), (x + 1, y), (x + 1, y + 1), (x, y + 1)]
-        for n in range(4):
-            add(corners[n], corners[(n + 1) % 4])
-    contours = []
-    while start := next((point for point, ends in edges.items() if ends), None):
-        points = [start]
-        while (end := edges[points[-1]].pop()) != start:
-            points.append(end)
-        ends = [*points[1:], start]
-        contours.append(tuple(Line(*map(float, (*a, *b))) for a, b in zip(points, ends, strict=True)))
-    return spread(tuple(contours), gain)
 
 
 def tag_dictionary(board: str) -> cv2.aruco.Dictionary:
@@ -184,11 +159,11 @@ def tag_board(name: str, side_mm: float) -> TagBoard:
     return TagBoard(name, side_mm, side_mm, keypoints, black)
 
 
-Modules = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
+Pattern = tuple[NDArray[np.bool_], dict[int, tuple[float, float]]]
 """Whether each module is black; and by ID, the keypoints' positions (x, y) in modules from the board's top left."""
 
 
-def _two_tags(name: str) -> Modules:
+def _two_tags(name: str) -> Pattern:
     tags = tag_dictionary(name)
     width = tags.markerSize + 2
     black = np.zeros((TAGS_PER_BOARD * (width + 1) + 1,) * 2, bool)
@@ -201,7 +176,7 @@ def _two_tags(name: str) -> Modules:
     return black, corners
 
 
-def _charuco() -> Modules:
+def _charuco() -> Pattern:
     pattern = charuco_pattern()
     columns, rows = (SQUARE_MODULES * squares for squares in CHARUCO_SQUARES)
     black = np.zeros((columns + 2,) * 2, bool)

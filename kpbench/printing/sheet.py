@@ -17,6 +17,7 @@ from kpbench.geometry.outline import move, rectangle
 from kpbench.patches.board import Board
 from kpbench.patches.board_sidecar import BOARD_SCHEMA
 from kpbench.patches.design import Patch
+from kpbench.patches.reference import REFERENCE_KIND, ReferenceMark
 from kpbench.patches.symmetry import pose_problem
 from kpbench.printing.font import font_size
 from kpbench.printing.marks import TICK, TICK_GAP, crop_mark, disc_marks, frame, registration_cross
@@ -171,6 +172,8 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
         "keypoints": keypoints,
         "tiles": [_tile_entry(t, n, page_format) for n, t in enumerate(tiles, 1)],
     }
+    if board.references:
+        sidecar["references"] = [_reference_entry(mark, tiles, page_format) for mark in board.references]
     return Sheet(board.name, tuple(_tile_page(board, t, tiles, page_format) for t in tiles), sidecar)
 
 
@@ -181,6 +184,21 @@ def _tile_entry(tile: Tile, page: int, page_format: PageFormat) -> dict[str, Any
         page_x, page_y = page_format.position_on_paper(*_on_page(tile, page_format, x, y))
         corners.append({"x_mm": round_to_nm(x), "y_mm": round_to_nm(y), "page_x_mm": page_x, "page_y_mm": page_y})
     return {"page": page, "row": tile.row + 1, "column": tile.column + 1, "corners": corners}
+
+
+def _reference_entry(mark: ReferenceMark, tiles: Sequence[Tile], page_format: PageFormat) -> dict[str, Any]:
+    """Return the entry of one reference mark in the sidecar; its corners are clockwise from the top left."""
+    page = next(n for n, t in enumerate(tiles) if t.contains(mark.x_mm, mark.y_mm))
+    corners = mark.corners_mm.tolist()
+    on_paper = (page_format.position_on_paper(*_on_page(tiles[page], page_format, x, y)) for x, y in corners)
+    return {
+        "kind": REFERENCE_KIND,
+        "dictionary": mark.dictionary,
+        "id": mark.mark_id,
+        "corners_mm": [[round_to_nm(x), round_to_nm(y)] for x, y in corners],
+        "page": page + 1,
+        "page_corners_mm": [list(corner) for corner in on_paper],
+    }
 
 
 def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], page_format: PageFormat) -> Page:
@@ -196,6 +214,10 @@ def _tile_page(board: Board, tile: Tile, tiles: Sequence[Tile], page_format: Pag
             shapes.append(
                 _ink(k.patch, *_on_page(tile, page_format, k.x_mm, k.y_mm), k.diameter_mm, k.rotate_deg, page_format)
             )
+    for mark in board.references:
+        if tile.contains(mark.x_mm, mark.y_mm):
+            region = mark.white_region if page_format.inverted else mark.region
+            shapes.append(Shape(move(region, *_on_page(tile, page_format, 0.0, 0.0)), INK))
     for x, y in tile.corners:
         page_x, page_y = _on_page(tile, page_format, x, y)
         right, down = (1 if x == tile.x1 else -1), (1 if y == tile.y1 else -1)

@@ -140,5 +140,12 @@ def correct_sidecar(sidecar: Mapping[str, Any], measured_mm: tuple[float, float]
     result = dict(sidecar) | {"print_scale": scale, "keypoints": [correct(k) for k in sidecar["keypoints"]]}
     if "side_mm" in sidecar:
         result["side_mm"] = [round_to_nm(side * s) for side, s in zip(sidecar["side_mm"], scale, strict=True)]
+        if "references" in sidecar:
+            result["references"] = [_correct_mark(mark, scale) for mark in sidecar["references"]]
         result["tiles"] = [t | {"corners": [correct(c) for c in t["corners"]]} for t in sidecar["tiles"]]
     return result
+
+
+def _correct_mark(mark: Mapping[str, Any], scale: list[float]) -> dict[str, Any]:
+    corners = [[round_to_nm(float(v) * s) for v, s in zip(corner, scale, strict=True)] for corner in mark["corners_mm"]]
+    return dict(mark) | {"corners_mm": corners}

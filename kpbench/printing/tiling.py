@@ -1,4 +1,4 @@
-"""Tiles: pieces of a board, cut along straight seams that pass between patches. Each tile fits a page."""
+"""Tiles: pieces of a board, cut along straight seams that pass between patches and marks. Each tile fits a page."""
 
 from __future__ import annotations
 
@@ -41,10 +41,10 @@ def cut_into_tiles(board: Board, width_mm: float, height_mm: float) -> list[Tile
         If no straight seam passes between the patches.
     """
     cuts = []
-    for side, longest, spans in (
-        (board.side_x_mm, width_mm, [(k.x_mm - k.extent_mm, k.x_mm + k.extent_mm) for k in board.keypoints]),
-        (board.side_y_mm, height_mm, [(k.y_mm - k.extent_mm, k.y_mm + k.extent_mm) for k in board.keypoints]),
-    ):
+    across = [(k.x_mm, k.extent_mm) for k in board.keypoints] + [(m.x_mm, m.width_mm / 2) for m in board.references]
+    down = [(k.y_mm, k.extent_mm) for k in board.keypoints] + [(m.y_mm, m.height_mm / 2) for m in board.references]
+    for side, longest, places in ((board.side_x_mm, width_mm, across), (board.side_y_mm, height_mm, down)):
+        spans = [(middle - extent, middle + extent) for middle, extent in places]
         found = _seams(spans, side, longest)
         if found is None:
             raise DesignError(

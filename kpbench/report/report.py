@@ -279,7 +279,12 @@ def _describe_images(report: Report) -> str:
     n = first.overall.counts
     made = f" {report.images}" if report.images else ""
     fingerprint = f", fingerprint {first.fingerprint[:16]}" if first.fingerprint else ""
-    return f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{fingerprint}."
+    text = f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{fingerprint}."
+    if first.outcomes.truth_points.least_reach_px is not None:
+        error = first.truth_error
+        text += f" The truth has a standard deviation of {error['sigma_median_px']:.4f} px (median); it limits the "
+        text += f"matching threshold of {error['limited']:.0f} keypoints."
+    return text
 
 
 def to_html(report: Report) -> str:

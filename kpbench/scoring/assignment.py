@@ -37,6 +37,8 @@ class TruthPoints:
         Radius of the keypoint's disc, px. The matching threshold is given in radii.
     image : ndarray of shape (T,), int64
         Index of the image, from 0.
+    least_reach_px : ndarray of shape (T,), float64, or None
+        Least matching threshold, px, if the truth has errors. None: the truth is exact.
 
     Examples
     --------
@@ -50,6 +52,12 @@ class TruthPoints:
     xy: Float
     radius: Float
     image: Int
+    least_reach_px: Float | None = None
+
+    def reach(self, eps: float) -> Float:
+        """Return the largest distance of a match from each keypoint, px, at a matching threshold in radii."""
+        reach = eps * self.radius
+        return reach if self.least_reach_px is None else np.maximum(reach, self.least_reach_px)
 
 
 @dataclass(frozen=True)
@@ -151,7 +159,7 @@ def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
     -------
     Matches
     """
-    reach = eps * truth.radius
+    reach = truth.reach(eps)
     near = _find_pairs(truth, found, np.maximum(reach, truth.radius))
     pairs = near.select(near.distance <= reach[near.t])
     contested = _find_contested(pairs)
@@ -170,10 +178,10 @@ def match(truth: TruthPoints, found: DetectionPoints, eps: float) -> Matches:
 
 def count_matches(truth: TruthPoints, found: DetectionPoints, eps: Sequence[float]) -> list[int]:
     """Count the matched keypoints at each matching threshold in ``eps``, see :func:`match`."""
-    near = _find_pairs(truth, found, max(eps) * truth.radius)
+    near = _find_pairs(truth, found, truth.reach(max(eps)))
     counts = []
     for value in eps:
-        pairs = near.select(near.distance <= value * truth.radius[near.t])
+        pairs = near.select(near.distance <= truth.reach(value)[near.t])
         counts.append(len(_choose_matches(pairs, _find_contested(pairs), truth, found)))
     return counts
 

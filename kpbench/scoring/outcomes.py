@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from kpbench.errors import DataError
 from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
 from kpbench.scoring.fingerprint import find_images, warn_of_ids
-from kpbench.types import Int, Predictions, Truth
+from kpbench.types import Float, Int, Predictions, Truth
+
+TRUTH_REACH = 3.0
+"""Least matching threshold, in standard deviations of the truth along its worst direction."""
 
 
 @dataclass(frozen=True)
@@ -112,6 +115,12 @@ class Outcomes:
     def matched(self) -> NDArray[np.bool_]:
         """Whether each true keypoint is matched, of shape (T,)."""
         return self.matches.detection >= 0
+
+    @property
+    def truth_limited(self) -> NDArray[np.bool_]:
+        """Whether the error of the truth sets the matching threshold of each keypoint, of shape (T,)."""
+        points = self.truth_points
+        return points.reach(self.settings.eps) > self.settings.eps * points.radius
 
     @cached_property
     def image_sums(self) -> Int:
@@ -229,4 +238,29 @@ def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
             f"image_id {truth.image_id[image[row]]}: a true keypoint at {xy[row].tolist()} has radius "
             f"{radius[row]}, expected finite numbers and a radius over 0"
         )
-    return TruthPoints(xy, radius, image)
+    covariance = truth_covariance(keypoints)
+    if covariance is None:
+        return TruthPoints(xy, radius, image)
+    return TruthPoints(xy, radius, image, TRUTH_REACH * np.sqrt(np.linalg.eigvalsh(covariance)[:, 1]))
+
+
+def truth_covariance(keypoints: NDArray[Any]) -> Float | None:
+    """Return the covariances of the errors of the truth, ndarray of shape (T, 2, 2), px²; None if it is exact.
+
+    Raises
+    ------
+    DataError
+        If a standard deviation is negative or not finite, or a correlation is not within -1 and 1.
+    """
+    if "sigma_x" not in (keypoints.dtype.names or ()):
+        return None
+    x, y, rho = (keypoints[name].astype(np.float64) for name in ("sigma_x", "sigma_y", "rho"))
+    valid = np.isfinite(x) & np.isfinite(y) & (np.minimum(x, y) >= 0) & (np.abs(rho) <= 1)
+    if not valid.all():
+        n = int(np.argmin(valid))
+        raise DataError(
+            f"keypoint {n} of the truth has sigma_x {x[n]}, sigma_y {y[n]} and rho {rho[n]}, expected finite numbers, "
+            "sigmas of 0 or more, and rho within -1 and 1"
+        )
+    xy = rho * x * y
+    return np.stack([np.stack([x * x, xy], axis=1), np.stack([xy, y * y], axis=1)], axis=1)

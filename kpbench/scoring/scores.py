@@ -148,11 +148,23 @@ class Scores:
             for g in (self.overall, *self.by)
         ]
 
+    @property
+    def truth_error(self) -> dict[str, float]:
+        """Errors of the truth of labelled photographs: median standard deviation, and keypoints that they limit."""
+        table = self.outcomes.truth.keypoints
+        sigma = np.sqrt((table["sigma_x"].astype(float) ** 2 + table["sigma_y"].astype(float) ** 2) / 2)
+        median = float(np.median(sigma)) if len(sigma) else 0.0
+        return {"sigma_median_px": median, "limited": int(self.outcomes.truth_limited.sum())}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the scores file (``kpbench.scores/1``), without provenance."""
         return {
             "schema": SCHEMA,
-            "dataset": {"fingerprint": self.fingerprint or None, "images": self.overall.counts["images"]},
+            "dataset": {
+                "fingerprint": self.fingerprint or None,
+                "images": self.overall.counts["images"],
+                **({} if self.outcomes.truth_points.least_reach_px is None else {"truth": self.truth_error}),
+            },
             "detector": self.detector,
             "settings": asdict(self.settings),
             "metrics": self.overall.to_dict(),

@@ -6,7 +6,7 @@ into the frame of the patch, by the rotation that is nearest to the affine part 
 polar decomposition [1]_).
 
 The normalised estimation error squared (NEES) of an error e with covariance C is eᵀC⁻¹e. If C is right, its mean is 2
-for the two coordinates of a keypoint [2]_.
+for the two coordinates of a keypoint [2]_. If the truth has an error, its covariance is added to C.
 
 References
 ----------
@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.scoring.bootstrap import Interval, bootstrap_intervals
-from kpbench.scoring.outcomes import Outcomes
+from kpbench.scoring.outcomes import Outcomes, truth_covariance
 from kpbench.types import Float, Int
 
 LEAST_TILT = 1e-9
@@ -76,6 +76,9 @@ def measure_errors(outcomes: Outcomes, row: Int) -> MatchedErrors:
     error = outcomes.detections.xy[detection] - outcomes.truth_points.xy[row]
     covariance = outcomes.detections.covariance
     nees, sigma_px = (None, None) if covariance is None else _normalise(error, covariance[detection])
+    of_truth = truth_covariance(outcomes.truth.keypoints)
+    if covariance is not None and of_truth is not None:  # the truth errs, too
+        nees = _normalise(error, covariance[detection] + of_truth[row])[0]
     in_patch, along_tilt = _turn(error, outcomes.truth.keypoints["H_patch2image"][row])
     scene = outcomes.truth.scene_id[outcomes.truth_points.image[row]]
     return MatchedErrors(in_patch, along_tilt, nees, sigma_px, scene)
