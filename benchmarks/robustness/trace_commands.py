@@ -57,6 +57,12 @@ score small.csv --gt coco/annotations.json --report report.md
 score small.csv --gt set --report report.tex
 compare small.csv template.json --gt set --json compared.json --report compared.html
 bench --suite paper-v1 --images 1 --size 203x155 --only blur --detector orb --detector aruco --out bench
+suite video-v1 --images 1 --frames 3 --size 406x310 --only speed --out films
+track films --poses poses.jsonl --overlay tracked.mp4
+score poses.jsonl --gt films
+calibrate sheet/photos --board sheet/board/truth.json --report camera.html
+label sheet/photos --board sheet/board/truth.json --camera camera.yaml --out labelled
+print-check sheet/photos --board sheet/board/truth.json
 train --config recipe.toml --out run
 export-model run/checkpoint.safetensors --out weights.onnx
 detect set --detector weights.onnx --out weights.json
@@ -127,6 +133,9 @@ def prepare(work: Path) -> None:
     from kpbench.detectors.superpoint import WEIGHTS
 
     (work / "small.onnx").write_bytes((WEIGHTS / "superpoint-small.onnx").read_bytes())
+    photograph = Path(__file__).parents[1] / "accuracy" / "truth_board_photos.py"
+    photos = ("--photos", "8", "--size", "812", "620")
+    subprocess.run([sys.executable, photograph, work / "sheet", *photos], check=True)
 
 
 def main() -> int:

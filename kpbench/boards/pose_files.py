@@ -14,7 +14,7 @@ import numpy as np
 from kpbench.boards.images import PoseRecord
 from kpbench.boards.pose import BoardPose
 from kpbench.errors import DataError, PredictionsError, system_reason
-from kpbench.files import encode_utf8, read_bytes
+from kpbench.files import encode_utf8, open_file, read_bytes
 from kpbench.text import escape_csv
 from kpbench.writing import require_writable, write_file
 
@@ -84,7 +84,7 @@ def write_poses(path: str | Path, records: Sequence[PoseRecord]) -> None:
 def holds_poses(path: str | Path) -> bool:
     """Return whether a file begins as a file of poses does."""
     try:
-        with Path(path).open("rb") as file:
+        with open_file(path, is_noted=False) as file:
             return POSES_SCHEMA.encode() in file.read(64)
     except OSError:
         return False

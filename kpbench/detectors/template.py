@@ -251,8 +251,8 @@ class TemplateDetector:
     >>> black = patch.is_black(np.stack([u, v], axis=-1))
     >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.uint8)
     >>> found = TemplateDetector((patch,))(image)
-    >>> found.xy.round(1), found.patch_id
-    (array([[31.5, 31.5]]), array([1]))
+    >>> bool(np.hypot(*(found.xy[0] - 31.5)) < 0.3), found.patch_id
+    (True, array([1]))
     """
 
     patches: tuple[Patch, ...] = field(default_factory=shipped_patches)

@@ -137,8 +137,8 @@ def verify_candidates(
     >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.uint8)
     >>> log_id = np.log(np.full((1, len(patches) + 1), 0.2))
     >>> found = verify_candidates(image, np.array([[48.0, 49.0]]), np.array([0.9]), log_id, patches)
-    >>> found.xy.round(1), patches[found.design[0]].name
-    (array([[47.5, 47.5]]), 'trefoil')
+    >>> found.xy.round(), patches[found.design[0]].name
+    (array([[48., 48.]]), 'trefoil')
     """
     pyramids = Pyramids(grey)
     with one_blas_thread():

@@ -2,8 +2,8 @@
 
 :func:`fit` renders the design with exact coverage, blurs the rendering, and changes the unknowns until rendering and
 pixels agree (Gauss-Newton with robust weights). The unknowns are the centre, the affine map, the perspective, both
-inks, the blur, the tone curve, the ink gain, the lens and the slope of the light. :mod:`kpbench.fitting.sector_search`
-and :mod:`kpbench.fitting.align` find poses to start from.
+inks, the blur and its unevenness, the tone curve, the ink gain, the lens and the slope of the light.
+:mod:`kpbench.fitting.sector_search` and :mod:`kpbench.fitting.align` find poses to start from.
 """
 
 from __future__ import annotations
@@ -15,8 +15,15 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
-from kpbench.fitting.covariance import PIXEL_VARIANCE, centre_covariance, noise_grain, start_covariance, uneven_columns
-from kpbench.fitting.drawing import MODEL_REACH, draw_black_cells, move_cells
+from kpbench.fitting.covariance import PIXEL_VARIANCE, centre_covariance, noise_grain, start_covariance
+from kpbench.fitting.drawing import (
+    MODEL_REACH,
+    blur_derivatives,
+    draw_black_cells,
+    move_cells,
+    tone_curve,
+    tone_slopes,
+)
 from kpbench.geometry.coverage import Box
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -40,14 +47,17 @@ EXPECTED_LENS = 0.1
 """Prior of the lens: standard deviation of Brown's k1, if the longer side of the image is the focal length."""
 EXPECTED_LIGHT = 0.015
 """Prior of the light: standard deviation of its change over a short semi-axis, as a share."""
-LARGEST_EXTRAS = np.array([0.3, 0.3, 1.5, 1.0, 0.03, 0.5, 0.3, 0.3])
-"""Largest size of the extras: of k1 for the lens, per short semi-axis for the light. Steeper tone curves fall."""
-EXTRA_POWERS = np.array([0, 0, 0, 0, 0, -2, -1, -1])  # powers of px in the units of the extras
-FINE_EXTRAS = slice(3, 4)
+EXPECTED_UNEVEN_PX2 = 0.6
+"""Prior of the unevenness of the blur: standard deviation of both coefficients, px² of the image."""
+LARGEST_EXTRAS = np.array([0.3, 0.3, 1.5, 1.0, 0.03, 0.5, 0.3, 0.3, 0.7, 0.7])
+"""Largest size of the extras: of k1 for the lens, per short semi-axis for the light, per blur variance for the
+unevenness. Steeper tone curves fall."""
+EXTRA_POWERS = np.array([0, 0, 0, 0, 0, -2, -1, -1, 2, 2])  # powers of px in the units of the extras
+FINE_EXTRAS = [3, 8, 9]
 """The coarse steps leave these extras, which would follow errors of the pose."""
-EXTRAS, UNKNOWNS = 8, 17
+EXTRAS, UNKNOWNS = 10, 19
 """Numbers of unknowns with a prior, and of all unknowns."""
-LEAST_SHRINK, LARGEST_GROWTH = 0.25, 1.5
+LEAST_SHRINK, LARGEST_GROWTH = 0.1, 1.5
 """A step changes the blur's variance v to ``LEAST_SHRINK`` v at least, ``LARGEST_GROWTH`` (v + 1 px²) at most."""
 MARGIN_BLURS = 1.6
 """Width of the rim that is left out, in standard deviations of the blur: the ground shines into the blurred rim."""
@@ -161,8 +171,9 @@ class _State:
     of the last step, relative to that of a settled one.
 
     ``extras`` are the unknowns with a prior: the first two entries of the last row of the homography (the bend), the
-    two coefficients of the tone curve (see :func:`_tone_curve`), the ink gain in disc radii, the lens in 1/px² (Brown's
-    k1 over the square of the focal length), and the change of the light along x and y, a share per px.
+    two coefficients of the tone curve (see :func:`tone_curve`), the ink gain in disc radii, the lens in 1/px² (Brown's
+    k1 over the square of the focal length), the change of the light along x and y, a share per px, and the unevenness
+    of the blur: half the difference of its variances along x and y, and their covariance, px².
     """
 
     xy: Float
@@ -242,10 +253,12 @@ def _step(state: _State, image: Float32, box: Box, drawing: Float32, extent: flo
         return state
     row = inside // (x1 - x0)
     dx, dy = dx.take(inside - row * (x1 - x0)), dy.take(row)
-    light_x, light_y = state.extras[6:].astype(np.float32)
+    light_x, light_y, *uneven = state.extras[6:].astype(np.float32)
+    by_blur = blur_derivatives(ink)
     grey = image[y0:y1, x0:x1].ravel().take(inside) / (1 + light_x * dx + light_y * dy)
-    covered, tone = ink.ravel().take(inside), (float(state.extras[2]), float(state.extras[3]))
-    toned = _tone_curve(covered, *tone)
+    covered = (ink + uneven[0] * by_blur[1] + uneven[1] * by_blur[2]).ravel().take(inside)
+    tone = float(state.extras[2]), float(state.extras[3])
+    toned = tone_curve(covered, *tone)
     state, slope, residual = _measure(state, grey, toned)
     if not left or slope > -1:
         return state
@@ -254,11 +267,11 @@ def _step(state: _State, image: Float32, box: Box, drawing: Float32, extent: flo
     if len(edge) < LEAST_PIXELS:
         return state
     at = inside[edge]
-    steep, *bends = _tone_slopes(covered.take(edge), *tone)
+    steep, *bends = tone_slopes(covered.take(edge), *tone)
     steep *= np.float32(slope)
     sloped = [steep * values.take(edge) for values in gradient]
-    laplace = steep * cv2.Laplacian(ink, cv2.CV_32F).ravel()[at]
-    moves = _derivatives(state, slope, toned.take(edge), bends, sloped, laplace, dx.take(edge), dy.take(edge))
+    blurs = [steep * plane.ravel().take(at) for plane in by_blur]
+    moves = _derivatives(state, slope, toned.take(edge), bends, sloped, blurs, dx.take(edge), dy.take(edge))
     # pixels that the model cannot explain, such as shadow edges, rain and occluders, get a smaller weight
     of_edges = residual.take(edge)
     size, half = np.abs(of_edges), len(edge) // 2
@@ -268,8 +281,8 @@ def _step(state: _State, image: Float32, box: Box, drawing: Float32, extent: flo
     stepped, change, prior = _solve_step(state, normal, target, minor, extent, level, is_coarse=left >= FINE_STEPS)
     if left > 1 and stepped.moved > 1:
         return stepped
-    grain, richer = noise_grain(np.clip(residual, -usual, usual)), uneven_columns(ink, at, steep)
-    covariance = centre_covariance(moves, weighted, of_edges, normal, change, prior, richer, grain)
+    grain = noise_grain(np.clip(residual, -usual, usual))
+    covariance = centre_covariance(moves, weighted, of_edges, normal, change, prior, grain)
     return replace(stepped, covariance=covariance * max(1.0, _edge_width(stepped.blur) / _edge_width(state.blur)))
 
 
@@ -292,14 +305,15 @@ def _derivatives(
     toned: Float32,
     bends: list[Float32],
     sloped: list[Float32],
-    laplace: Float32,
+    blurs: list[Float32],
     dx: Float32,
     dy: Float32,
 ) -> Float32:
-    """Return the derivatives (17, n) of n grey values with respect to the unknowns, as :func:`_solve_step` orders them.
+    """Return the derivatives (19, n) of n grey values with respect to the unknowns, as :func:`_solve_step` orders them.
 
     ``bends`` holds the derivatives of the ink with respect to the coefficients of the tone curve. ``sloped`` holds
-    those of the grey values with respect to x, y and ink gain. ``dx``, ``dy`` are places relative to the centre, px.
+    those of the grey values with respect to x, y and ink gain, ``blurs`` those with respect to the blur.
+    ``dx``, ``dy`` are places relative to the centre, px.
     """
     a, b, c, d = _inverse(state.A)
     (u, v), (gx, gy, gain) = (a * dx + b * dy, c * dx + d * dy), sloped
@@ -312,14 +326,14 @@ def _derivatives(
         (gx, v),
         (gy, u),
         (gy, v),
-        (laplace, np.float32(0.5)),
         (outward, -u),
         (outward, -v),
         (bends[0], k),
         (bends[1], k),
     )
     lens = x * gx + y * gy, dx * dx + dy * dy
-    rows = (4, 5, 6, 7, 8, 9, 10, 11, 12, 14, 15, 16)
+    moves[8], moves[17], moves[18] = blurs
+    rows = (4, 5, 6, 7, 9, 10, 11, 12, 14, 15, 16)
     for row, (first, second) in zip(rows, (*products, lens, (shade, dx), (shade, dy)), strict=True):
         np.multiply(first, second, out=moves[row])
     return moves
@@ -328,22 +342,6 @@ def _derivatives(
 def _edge_width(blur: float) -> float:
     """Return the standard deviation of an edge's profile, px. The variance of a centre is proportional to it."""
     return float(np.sqrt(blur**2 + PIXEL_VARIANCE))
-
-
-def _tone_curve(ink: Float32, a: float, b: float) -> Float32:
-    """Return how black pixels look behind a tone curve.
-
-    Light is blurred before a camera's tone curve. So a pixel that black ink covers by half is darker or brighter than
-    the mean of the inks. Between the inks, the curve is ``ink + a ink (1 - ink) + b ink (1 - ink) (1 - 2 ink)``: any
-    smooth curve that keeps both inks, to third order. Ink that spreads has nearly the same effect as ``a``.
-    """
-    return ink + ink * (1 - ink) * (np.float32(a + b) - np.float32(2 * b) * ink)
-
-
-def _tone_slopes(ink: Float32, a: float, b: float) -> tuple[Float32, Float32, Float32]:
-    """Return the derivatives of :func:`_tone_curve` with respect to ``ink``, ``a`` and ``b``."""
-    even, bent = ink * (1 - ink), 1 - 2 * ink
-    return 1 + np.float32(a) * bent + np.float32(b) * (1 - 6 * even), even, even * bent
 
 
 def _inverse(m: Float) -> tuple[float, float, float, float]:
@@ -364,9 +362,9 @@ def _solve_step(
     Returns
     -------
     stepped : _State
-    change : ndarray of shape (17,)
+    change : ndarray of shape (19,)
         Change of the unknowns.
-    prior : ndarray of shape (8,)
+    prior : ndarray of shape (10,)
         What is added to the diagonal of ``normal`` for the extras.
     """
     # the pixels of a design of sectors alone do not determine its size and some stretches, so damping holds them
@@ -375,6 +373,7 @@ def _solve_step(
     diagonal[:4] += 1e-3
     bend, side, light = EXPECTED_BEND_PER_PX * minor, 2 * float(state.middle.max()) + 1, EXPECTED_LIGHT / minor
     expected = [bend, bend, EXPECTED_TONE, EXPECTED_TONE, EXPECTED_GAIN, EXPECTED_LENS / side**2, light, light]
+    expected += [EXPECTED_UNEVEN_PX2 / 4.0**level] * 2
     prior = (state.noise**2 + 1) / np.square(expected)
     if is_coarse:
         prior[FINE_EXTRAS] *= 1e6
@@ -386,7 +385,7 @@ def _solve_step(
     variance = state.blur**2
     widened = min(max(variance + float(delta[8]), LEAST_SHRINK * variance), LARGEST_GROWTH * (variance + 1))
     blur = float(np.sqrt(min(max(widened, 0.04), (0.5 * minor) ** 2)))
-    limit = LARGEST_EXTRAS / [1, 1, 1, 1, 1, side**2, minor, minor]
+    limit = LARGEST_EXTRAS * [1, 1, 1, 1, 1, 1 / side**2, 1 / minor, 1 / minor, blur**2, blur**2]
     extras = np.minimum(np.maximum(state.extras + delta[-EXTRAS:], -limit), limit)
     # a stronger bend would put part of the model behind the camera
     extras[:2] *= min(1.0, 0.56 / (MODEL_REACH * extent * max(float(np.hypot(*extras[:2].tolist())), 1e-9)))

@@ -1,10 +1,11 @@
-"""Draw designs for the fit: exact coverage by black ink, and its exact derivatives."""
+"""Draw designs for the fit: exact coverage by black ink, blur and tone curve, and their derivatives."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
 
+import cv2
 import numpy as np
 
 from kpbench.geometry.coverage import Box, rasterise_with_derivatives
@@ -112,3 +113,29 @@ def black_cells(patch: Patch, tolerance: float) -> tuple[Float, Float, Int]:
     first = np.cumsum([0, *map(len, corners)])
     following = [np.roll(np.arange(len(c)), -1) + n for c, n in zip(corners, first, strict=False)]
     return np.concatenate(corners), np.concatenate(outward), np.concatenate(following)
+
+
+def blur_derivatives(ink: Float32) -> tuple[Float32, Float32, Float32]:
+    """Return the derivatives of blurred ink with respect to the blur's variance and the two of its unevenness.
+
+    A Gaussian blur solves the heat equation, so they are half of the second derivatives of the ink.
+    """
+    xx, yy = (cv2.Sobel(ink, cv2.CV_32F, *order, ksize=1, scale=0.5) for order in ((2, 0), (0, 2)))
+    xy: Float32 = np.asarray(cv2.Sobel(ink, cv2.CV_32F, 1, 1, ksize=3, scale=0.25))
+    return xx + yy, xx - yy, xy
+
+
+def tone_curve(ink: Float32, a: float, b: float) -> Float32:
+    """Return how black pixels look behind a tone curve.
+
+    Light is blurred before a camera's tone curve. So a pixel that black ink covers by half is darker or brighter than
+    the mean of the inks. Between the inks, the curve is ``ink + a ink (1 - ink) + b ink (1 - ink) (1 - 2 ink)``: any
+    smooth curve that keeps both inks, to third order. Ink that spreads has nearly the same effect as ``a``.
+    """
+    return ink + ink * (1 - ink) * (np.float32(a + b) - np.float32(2 * b) * ink)
+
+
+def tone_slopes(ink: Float32, a: float, b: float) -> tuple[Float32, Float32, Float32]:
+    """Return the derivatives of :func:`tone_curve` with respect to ``ink``, ``a`` and ``b``."""
+    even, bent = ink * (1 - ink), 1 - 2 * ink
+    return 1 + np.float32(a) * bent + np.float32(b) * (1 - 6 * even), even, even * bent

@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 
 from kpbench.fitting.align import short_semi_axis
-from kpbench.fitting.covariance import UNEVEN_BLUR_PX2, start_covariance
-from kpbench.fitting.design_fit import EXPECTED_LIGHT, EXPECTED_TONE, MARGIN_BLURS
+from kpbench.fitting.covariance import start_covariance
+from kpbench.fitting.design_fit import EXPECTED_LIGHT, EXPECTED_TONE, EXPECTED_UNEVEN_PX2, MARGIN_BLURS
 from kpbench.fitting.templates import draw_ink, look_up_ink
 from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32
@@ -137,7 +137,7 @@ def fit_samples(
         fixed = *(np.inf,) * 4, *(EXPECTED_TURN,) * 4, 0.0, EXPECTED_TONE, EXPECTED_LIGHT, EXPECTED_LIGHT, 0.0, 0.0
         deviation = np.tile(fixed, (len(xy), 1))
         deviation[:, 8] = EXPECTED_BLUR_PX2 * per_px2
-        deviation[:, 12:] = (UNEVEN_BLUR_PX2 / 2 * per_px2)[:, None]
+        deviation[:, 12:] = (EXPECTED_UNEVEN_PX2 * per_px2)[:, None]
         normal[:, range(COLUMNS), range(COLUMNS)] += noise2[:, None] / deviation**2 + 1e-6
         posterior = np.linalg.inv(normal)
         change = (posterior @ target)[..., 0]

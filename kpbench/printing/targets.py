@@ -92,8 +92,8 @@ def write_targets(boards: Sequence[Board], folder: str | Path, programs: Sequenc
     >>> import kpbench
     >>> from kpbench.printing import write_targets
     >>> board = kpbench.grid_board(kpbench.shipped_patches(), rows=2, columns=3, diameter_mm=20.0, pitch_mm=40.0)
-    >>> print(write_targets([board], "print", ["kalibr"])[0].read_text().splitlines()[1])
-    target_type: 'circlegrid'
+    >>> [path.name for path in write_targets([board], "print", ["kalibr"])]
+    ['grid.kalibr.yaml']
     """
     files = {
         Path(folder) / TARGET_FOLDER / f"{file_stem(board.name)}{suffix}": write(board)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kpbench import shipped_patches
-from kpbench.fitting.design_fit import _tone_curve, _tone_slopes
+from kpbench.fitting.drawing import tone_curve, tone_slopes
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "accuracy" / "tone_bias.py"
 
@@ -30,10 +30,10 @@ def test_a_tone_curve_does_not_move_the_centre(tone_bias, patch, curve):
 
 def test_the_derivatives_of_the_tone_curve_are_those_of_its_values():
     ink, step = np.linspace(0, 1, 41, dtype=np.float32), np.float32(1e-3)
-    toned, (slope, even, odd) = _tone_curve(ink, 0.4, -0.3), _tone_slopes(ink, 0.4, -0.3)
+    toned, (slope, even, odd) = tone_curve(ink, 0.4, -0.3), tone_slopes(ink, 0.4, -0.3)
     assert toned[0] == 0
     assert toned[-1] == 1
-    up, down = (_tone_curve(ink + s, 0.4, -0.3) for s in (step, -step))
+    up, down = (tone_curve(ink + s, 0.4, -0.3) for s in (step, -step))
     np.testing.assert_allclose((up - down) / (2 * step), slope, atol=2e-3)
-    np.testing.assert_allclose(_tone_curve(ink, 1.4, -0.3) - toned, even, atol=1e-6)
-    np.testing.assert_allclose(_tone_curve(ink, 0.4, 0.7) - toned, odd, atol=1e-6)
+    np.testing.assert_allclose(tone_curve(ink, 1.4, -0.3) - toned, even, atol=1e-6)
+    np.testing.assert_allclose(tone_curve(ink, 0.4, 0.7) - toned, odd, atol=1e-6)

@@ -74,7 +74,7 @@ def test_inks_keep_their_levels_behind_the_tone_curve_of_the_scene():
 def test_the_centre_of_the_picture_is_the_true_centre(patch, record):
     """A fit finds the true centre behind lens, motion and rolling shutter, in linear tone and without noise.
 
-    The fit knows only round blur, so that longer motion moves it by up to 0.08 px.
+    The fit knows uneven blur to first order only, so that longer motion still moves it.
     """
     linear = {"tone": {"name": "linear", "parameters": []}}
     scene = take(linear | record, patch=patch, xy=(40.2, 30.7))

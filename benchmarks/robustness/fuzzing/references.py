@@ -368,6 +368,7 @@ def toml_suite(data: bytes, found: Any) -> str:
             "effects": dict(got.effects),
             "camera": dict(got.camera),
             "board": got.board,
+            "film": dict(got.film),
         }
         if difference := _first_difference(table, given):
             return difference
