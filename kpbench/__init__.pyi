@@ -14,12 +14,12 @@ from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
 from .dataset.generation import generate as generate
 from .dataset.generation import merge as merge
+from .dataset.labelled import LabelledImages as LabelledImages
 from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
 from .errors import KpbenchError as KpbenchError
 from .evaluate import ComparedFiles as ComparedFiles
-from .evaluate import LabelledImages as LabelledImages
 from .evaluate import ScoredFile as ScoredFile
 from .evaluate import compare_files as compare_files
 from .evaluate import score_file as score_file
