@@ -61,7 +61,7 @@ ROOMS = {
     "degrade": ["geometry"],
     "predictions": [],
     "dataset": ["geometry", "predictions"],
-    "synth": ["geometry", "camera", "patches", "render", "degrade", "dataset"],
+    "synth": ["geometry", "camera", "patches", "render", "degrade", "predictions", "dataset"],
     "analysis": ["geometry", "camera", "patches", "printing", "render"],
     "scoring": ["geometry"],
     "report": ["scoring"],

@@ -53,7 +53,7 @@ class CocoDataset:
     path : Path
         The annotations file.
     truth : Truth
-        ``H_patch2image`` is zero and ``contrast`` too: annotations do not tell them.
+        ``H_patch2image`` is zero and ``contrast`` nan, as annotations do not tell them.
     files : tuple of str
         File names of the images, relative to the folder of the annotations file or to its ``images`` folder. The
         files may be missing. A file is read only if it lies below the folder, after symbolic links are followed.
@@ -289,6 +289,7 @@ def _make_keypoints(annotations: Columns) -> tuple[NDArray[Any], NDArray[np.bool
     table = np.zeros(len(points), KEYPOINT_DTYPE)
     table["x"], table["y"] = points[:, 0], points[:, 1]
     table["patch_id"] = annotations["category_id"] - 1
+    table["contrast"] = np.nan
     radius, major, minor = (annotations[name] for name in ("radius", "radius_major", "radius_minor"))
     with np.errstate(over="ignore"):  # some columns have 32 bits; a number that they cannot hold is refused as inf
         for name in ("axis_angle", "visible"):
