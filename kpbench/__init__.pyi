@@ -1,7 +1,8 @@
-from .benchmark import BenchRun as BenchRun
-from .benchmark import SuiteReport as SuiteReport
-from .benchmark import bench as bench
-from .benchmark import write_suite_reports as write_suite_reports
+from .benchmark.reports import SuiteReport as SuiteReport
+from .benchmark.reports import write_suite_reports as write_suite_reports
+from .benchmark.run import BenchRun as BenchRun
+from .benchmark.run import bench as bench
+from .benchmark.run import bench_dataset as bench_dataset
 from .boards.matching import BoardMatch as BoardMatch
 from .boards.matching import find_board as find_board
 from .boards.pose import BoardPose as BoardPose

@@ -14,6 +14,7 @@ from kpbench.dataset.labelled import LabelledImages, open_labelled
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite
 from kpbench.predictions.files import read_predictions
+from kpbench.provenance import image_source
 from kpbench.report.report import Report, require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
@@ -157,7 +158,7 @@ def score_file(
     _refuse_overwrite([path], {"scores": to_json, "table": to_csv, "report": to_report})
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _compute_poses(scores, dataset) if pose else ()
-    provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
+    provenance = collect_provenance(dataset, [path], command)
     if to_json:
         write_file(to_json, encode_scores(scores, provenance, poses))
     if to_csv:
@@ -212,7 +213,7 @@ def compare_files(
     _refuse_overwrite(paths, {"comparison": to_json, "report": to_report})
     dataset, scores = _score_files(paths, truth, warn, options)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
-    provenance = collect_provenance(dataset.path, dataset.fingerprint, paths, command)
+    provenance = collect_provenance(dataset, paths, command)
     if to_json:
         write_file(to_json, encode_comparisons(comparisons, provenance))
     if to_report:
@@ -306,6 +307,7 @@ def _write_report(
             cases = tuple(pick_worst_cases(run.outcomes, dataset.image, MOST_CASES // len(runs) or 1) for run in runs)
         except DataError as error:
             warn(f"{path} shows no images: {error}")
-    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
+    source = image_source(dataset.config)
+    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}{f', {source}' if source else ''}"
     tables = (pose_table(runs[0], poses),) if poses else ()
     write_report(path, Report(tuple(runs), dataset.config, cases, provenance, tuple(comparisons), tables, title))

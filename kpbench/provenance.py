@@ -7,6 +7,8 @@ from typing import Any
 
 IMAGE_SOURCES = ("simulated", "simulated photographs", "photographs")
 """What images can be. Simulated photographs are images that a simulated camera took, labelled as photographs are."""
+UNKNOWN_SOURCE = "not told"
+"""What tables say of images of which nothing tells what they are."""
 SIMULATORS = ("suite", "synth")
 """Kinds of config from which kpbench simulates images."""
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
 from kpbench.files import encode_utf8
-from kpbench.provenance import describe_images, image_source
+from kpbench.provenance import UNKNOWN_SOURCE, describe_images, image_source
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
 from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.score_charts import (
@@ -156,7 +156,7 @@ def _comparison_section(report: Report) -> Section:
 
 def _paper_section(report: Report) -> Section:
     known = [PAPER[name] for name in _conditions(report) if name in PAPER]
-    tables = [paper_table(report.runs, table, report.images or "the user's") for table in known]
+    tables = [paper_table(report.runs, table, report.images or UNKNOWN_SOURCE) for table in known]
     deteriorate, limits = str(report.config.get("deteriorate")), report.config.get("limits", {})
     radius_px = tuple(limits.get("radius_px", SYNTHETIC_RADIUS_PX))
     if deteriorate in SYNTHETIC and radius_px == SYNTHETIC_RADIUS_PX:

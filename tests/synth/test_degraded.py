@@ -11,6 +11,7 @@ from helpers import digests, kpbench, write_dataset
 from kpbench import SuiteConfig, generate, load_suite, open_dataset
 from kpbench.dataset.export import export_dataset
 from kpbench.predictions.files import write_predictions
+from kpbench.provenance import describe_images, image_source
 from kpbench.synth import DegradeConfig
 from kpbench.types import Detections, Predictions
 
@@ -123,7 +124,24 @@ def test_what_cannot_be_degraded_is_one_line(here, scales):
     ).stderr  # fmt: skip
 
 
-@pytest.mark.parametrize("source", ["simulated", "simulated photographs", "photographs", ""])
+@pytest.mark.parametrize(
+    ("config", "source"),
+    [
+        ({"kind": "synth"}, "simulated"),
+        ({"kind": "suite", "source": "photographs"}, "simulated"),
+        ({"kind": "degraded", "source": "simulated photographs"}, "simulated photographs"),
+        ({"source": "photographs"}, "photographs"),
+        ({"source": "photos"}, ""),
+        ({"source": ["photographs"]}, ""),
+        ({}, ""),
+    ],
+)
+def test_what_images_are_follows_from_the_config(config, source):
+    assert image_source(config) == source
+    assert describe_images(2, source) == f"2 {source or 'images'}{' images' * (source == 'simulated')}"
+
+
+@pytest.mark.parametrize("source", ["simulated photographs", "photographs"])
 def test_every_report_tells_what_the_images_are(here, dataset, source):
     """Simulated images never become photographs, on any way from a dataset to a table."""
     content = json.loads(export_dataset(dataset, "coco", "plain").read_text())
@@ -152,7 +170,7 @@ def test_every_report_tells_what_the_images_are(here, dataset, source):
     for name in (*files[2:], "bench/twice.html", "bench/twice.md"):
         text = (here / name).read_text()
         assert f"ours: {source or 'not told'})" in text, name
-        assert f"42 {what} in 6 scenes" in text, name
+        assert f"54 {what} in 6 scenes" in text, name
         if source.startswith("simulated"):
             assert not [line for line in text.splitlines() if "photographs" in line.replace("simulated photographs", "")
                         and "paper" not in line]  # fmt: skip
