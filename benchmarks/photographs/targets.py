@@ -17,6 +17,7 @@ import numpy as np
 
 import kpbench
 from kpbench.images import read_rgb
+from kpbench.predictions import open_coco
 from kpbench.types import UInt8
 
 EPS = 0.5
@@ -43,8 +44,8 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--detector", action="append", help="repeatable; default: all three that find patches")
     options = parser.parse_args()
-    detectors = options.detector or ["template", "superpoint-small", "superpoint"]
-    labels = kpbench.predictions.open_coco(Path(__file__).with_name("targets.json"))
+    detectors = options.detector or ["superpoint-small", "superpoint", "template"]
+    labels = open_coco(Path(__file__).with_name("targets.json"))
     print("real quadrant targets, photographs:\n")
     print(f"| photograph | size | semi-axes | {' | '.join(detectors)} |\n|{'---|' * (3 + len(detectors))}")
     found = dict.fromkeys(detectors, 0)
