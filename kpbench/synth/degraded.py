@@ -31,7 +31,7 @@ from kpbench.synth.suite import describe_condition
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.types import Float, UInt8
 
-FREE = ("", "free")
+FREE_CONDITIONS = ("", "free")
 """Conditions of images that belong to no rung."""
 POSE_CONDITIONS = {"scale": "area_percent", "pitch": "pitch_deg"}
 """The paper's conditions that change the view, and the quantity of a suite's scene that is their rung."""
@@ -248,8 +248,9 @@ class DegradeConfig:
 
 
 def is_degradation(condition: Condition) -> bool:
-    """Return whether a condition consists of effects on a finished image alone: no pose, camera or board of its own."""
-    return bool(condition.effects) and not condition.pose and not condition.camera and condition.board == "hexagon"
+    """Return whether a condition consists of effects on an image alone: no pose, camera, film or board of its own."""
+    own = condition.pose or condition.camera or condition.film or condition.board != "hexagon"
+    return bool(condition.effects) and not own
 
 
 def shows_base_view(suite: Suite, condition: str, rung: float) -> bool:
@@ -263,7 +264,7 @@ def shows_base_view(suite: Suite, condition: str, rung: float) -> bool:
     [False, True]
     """
     if condition not in POSE_CONDITIONS:
-        return condition in FREE
+        return condition in FREE_CONDITIONS
     low, high = dict(suite.scene)[POSE_CONDITIONS[condition]]
     return low <= rung <= high
 
