@@ -93,7 +93,7 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
         "schema": TABLE_SCHEMA,
         "detector": scores.name,
         "dataset": scores.fingerprint,
-        "source": provenance["dataset"]["source"] or "",
+        "source": provenance.get("dataset", {}).get("source") or "",
         "kpbench": provenance["kpbench"],
     }
     rows = [{name: escape_csv(value) for name, value in (about | row).items()} for row in scores.rows()]
