@@ -86,14 +86,15 @@ def export_dataset(
     if file_format not in EXPORT_FORMATS:
         raise DataError(f"`file_format` is {file_format!r}, expected one of: {', '.join(EXPORT_FORMATS)}")
     folder = Path(out)
-    splits = split_scenes(dataset.truth, val_share) if file_format == "yolo" else []
-    digest = hashlib.sha256(f"{dataset.fingerprint} {','.join(splits)}".encode()).hexdigest()
+    share = f"{val_share:g}" if file_format == "yolo" else ""
+    digest = hashlib.sha256(f"{dataset.fingerprint} {share}".encode()).hexdigest()
     mark, content = folder / UNFINISHED, f"{EXPORT_MARK} {file_format} {digest}\n".encode()
     if folder.is_dir() and any(path.name != LOCK_FILE for path in folder.iterdir()):
         if not mark.is_file():
             raise DataError(f"{folder}: is not empty; name a new folder as `out`")
         if mark.read_bytes() != content:
             raise DataError(f"{folder}: holds another unfinished export; name a new folder as `out`")
+    splits = split_scenes(dataset.truth, val_share) if file_format == "yolo" else []
     with lock_folder(make_folder(folder)):
         for part in filter(is_leftover, folder.rglob(".*.part")):  # of a killed run
             part.unlink()

@@ -100,7 +100,7 @@ def open_labelled(path: str | Path) -> Dataset | CocoDataset:
     >>> folder = kpbench.export_dataset(kpbench.open_dataset("kpbench-data"), "coco", "coco").parent
     >>> labelled = kpbench.dataset.open_labelled(folder)
     >>> len(labelled), labelled.keypoints(0)["x"].shape, labelled.image(0).shape
-    (6, (4,), (480, 640, 3))
+    (6, (6,), (480, 640, 3))
     """
     folder = folder_at(path)
     annotations = None if (folder / MANIFEST).exists() else find_coco(path)

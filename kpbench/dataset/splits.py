@@ -37,7 +37,7 @@ def split_scenes(truth: Truth, val_share: float = VAL_SHARE) -> list[str]:
     >>> from kpbench import open_dataset
     >>> from kpbench.dataset import split_scenes
     >>> split_scenes(open_dataset("kpbench-data").truth, val_share=0.3)
-    ['val', 'train', 'train', 'train', 'val', 'train']
+    ['train', 'train', 'train', 'val', 'val', 'train']
     """
     if not 0 <= val_share < 1:
         raise DataError(f"`val_share` is {val_share:g}, expected a share from 0 to less than 1")
