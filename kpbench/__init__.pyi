@@ -1,7 +1,8 @@
-from .benchmark import BenchRun as BenchRun
-from .benchmark import SuiteReport as SuiteReport
-from .benchmark import bench as bench
-from .benchmark import write_suite_reports as write_suite_reports
+from .benchmark.reports import SuiteReport as SuiteReport
+from .benchmark.reports import write_suite_reports as write_suite_reports
+from .benchmark.run import BenchRun as BenchRun
+from .benchmark.run import bench as bench
+from .benchmark.run import bench_dataset as bench_dataset
 from .boards.matching import BoardMatch as BoardMatch
 from .boards.matching import find_board as find_board
 from .boards.pose import BoardPose as BoardPose
@@ -14,12 +15,12 @@ from .dataset.folder import Dataset as Dataset
 from .dataset.folder import open_dataset as open_dataset
 from .dataset.generation import generate as generate
 from .dataset.generation import merge as merge
+from .dataset.labelled import LabelledImages as LabelledImages
 from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
 from .errors import KpbenchError as KpbenchError
 from .evaluate import ComparedFiles as ComparedFiles
-from .evaluate import LabelledImages as LabelledImages
 from .evaluate import ScoredFile as ScoredFile
 from .evaluate import compare_files as compare_files
 from .evaluate import score_file as score_file

@@ -8,13 +8,13 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack
 
-from kpbench.dataset.folder import MANIFEST, open_dataset
+from kpbench.dataset.labelled import LabelledImages, open_labelled
 from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite
-from kpbench.predictions.coco import open_coco
 from kpbench.predictions.files import read_predictions
+from kpbench.provenance import image_source
 from kpbench.report.report import Report, require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
@@ -26,57 +26,13 @@ from kpbench.report.score_tables import pose_table
 from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pose_errors
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score
-from kpbench.types import Predictions, Truth, UInt8
+from kpbench.types import Predictions
 from kpbench.writing import require_writable, write_file
 
 DEFAULT_DATASET = Path("kpbench-data")
 """Default folder of ``kpbench synth``. Scoring uses the folder if no dataset is named or the named one is gone."""
 MOST_CASES = 12
 """Largest number of images in the galleries of a report, divided among its detectors."""
-
-
-class LabelledImages(Protocol):
-    """The attributes of a dataset that scoring and reports need.
-
-    :class:`kpbench.Dataset` and COCO annotations have these attributes. A class of your own may have them too.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> dataset: kpbench.LabelledImages = kpbench.open_dataset("kpbench-data")
-    >>> len(dataset.truth), dataset.image(0).shape
-    (6, (480, 640))
-    """
-
-    @property
-    def path(self) -> Path:
-        """Folder of the dataset, or its annotations file."""
-        ...
-
-    @property
-    def fingerprint(self) -> str:
-        """Digest of the dataset, 64 hexadecimal digits."""
-        ...
-
-    @property
-    def config(self) -> Mapping[str, Any]:
-        """How the images were made, and the names of the patches; may be empty."""
-        ...
-
-    @property
-    def truth(self) -> Truth:
-        """The true keypoints of all images."""
-        ...
-
-    def image(self, index: int) -> UInt8:
-        """Return the image at an index into the truth, as an array of shape (H, W) or (H, W, 3).
-
-        Raises
-        ------
-        DataError
-            If the image cannot be read.
-        """
-        ...
 
 
 class ScoreOptions(TypedDict, total=False):
@@ -166,8 +122,8 @@ def score_file(
     predictions : str or Path
         File ending in .json, .jsonl, .csv, .parquet or .h5.
     truth : str, Path, LabelledImages or None
-        Folder of a dataset, COCO annotations (.json) or an open dataset. None takes the dataset that the predictions
-        name, else the folder ``kpbench-data``.
+        Path as for :func:`kpbench.dataset.open_labelled`, or an open dataset. None takes the dataset that the
+        predictions name, else the folder ``kpbench-data``.
     pose : bool
         Whether to compute errors of the board's pose also. The dataset must be made from a suite.
     json_file, csv_file, report_file : str, Path or None
@@ -202,7 +158,7 @@ def score_file(
     _refuse_overwrite([path], {"scores": to_json, "table": to_csv, "report": to_report})
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _compute_poses(scores, dataset) if pose else ()
-    provenance = collect_provenance(dataset.path, dataset.fingerprint, [path], command)
+    provenance = collect_provenance(dataset, [path], command)
     if to_json:
         write_file(to_json, encode_scores(scores, provenance, poses))
     if to_csv:
@@ -257,7 +213,7 @@ def compare_files(
     _refuse_overwrite(paths, {"comparison": to_json, "report": to_report})
     dataset, scores = _score_files(paths, truth, warn, options)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
-    provenance = collect_provenance(dataset.path, dataset.fingerprint, paths, command)
+    provenance = collect_provenance(dataset, paths, command)
     if to_json:
         write_file(to_json, encode_comparisons(comparisons, provenance))
     if to_report:
@@ -312,20 +268,17 @@ def _find_dataset(
 ) -> LabelledImages:
     """Open the dataset ``truth``, else the dataset that the predictions name, else ``kpbench-data``."""
     if truth is not None:
-        if not isinstance(truth, str | Path):
-            return truth
-        path = Path(truth)
-        return open_coco(path) if path.suffix.lower() == ".json" and path.name != MANIFEST else open_dataset(truth)
+        return open_labelled(truth) if isinstance(truth, str | Path) else truth
     named = predictions.dataset
     for folder in (Path(named), file.parent / named) if named else ():
         if os.path.exists(folder):  # Path.exists raises an error for a name that is too long
-            return open_dataset(folder)
+            return open_labelled(folder)
     problem = f"names the dataset {named!r}, which is not here" if named else "names no dataset"
     if not DEFAULT_DATASET.exists():
         raise PredictionsError(f"{file}: {problem}, and there is no ./{DEFAULT_DATASET}; name one with `truth`")
     if named and not re.fullmatch("[0-9a-f]{64}", named):  # a fingerprint names no folder that could be missing
         warn(f"{file} {problem}; scoring against ./{DEFAULT_DATASET}")
-    return open_dataset(DEFAULT_DATASET)
+    return open_labelled(DEFAULT_DATASET)
 
 
 def _compute_poses(scores: Scores, dataset: LabelledImages) -> tuple[PoseGroup, ...]:
@@ -354,6 +307,7 @@ def _write_report(
             cases = tuple(pick_worst_cases(run.outcomes, dataset.image, MOST_CASES // len(runs) or 1) for run in runs)
         except DataError as error:
             warn(f"{path} shows no images: {error}")
-    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}"
+    source = image_source(dataset.config)
+    title = f"{', '.join(run.name for run in runs)} on {dataset.path.name}{f', {source}' if source else ''}"
     tables = (pose_table(runs[0], poses),) if poses else ()
     write_report(path, Report(tuple(runs), dataset.config, cases, provenance, tuple(comparisons), tables, title))

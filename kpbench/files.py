@@ -9,7 +9,7 @@ import json
 import os
 import re
 import stat
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path, PureWindowsPath
@@ -319,8 +319,8 @@ def refuse_overwrite(targets: Iterable[Path | None], sources: Iterable[Path] = (
         taken.add(target.resolve())
 
 
-def require_own_folder(folder: Path, mark: str, purpose: str) -> None:
-    """Raise an error unless a folder is new, is empty, or holds the file ``mark`` of an earlier run.
+def require_own_folder(folder: Path, marks: Sequence[str], purpose: str) -> None:
+    """Raise an error unless a folder is new, is empty, or holds one of the files ``marks`` of an earlier run.
 
     Raises
     ------
@@ -330,7 +330,7 @@ def require_own_folder(folder: Path, mark: str, purpose: str) -> None:
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder}: a file, expected a folder")
     others = sorted(path.name for path in folder.glob("*") if not path.name.startswith("."))
-    if others and not (folder / mark).exists():
+    if others and not any((folder / mark).exists() for mark in marks):
         raise DataError(
             f"{folder}: holds other files ({others[0]}, ...), expected a new or an empty folder for {purpose}"
         )

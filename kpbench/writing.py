@@ -36,7 +36,7 @@ _TEXT_MARKS = [
         rb"<!-- MARK -->\n",  # Markdown of a report
         rb"---\n(?:[^\n]+\n){1,9}---\n\n<!-- MARK: kpbench replaces this file ",  # Markdown of a dataset's card
         rb"% MARK\n",  # LaTeX
-        rb"# MARK\ntrain: images\n",  # YAML of an export
+        rb"# MARK\ntrain: images(?:/train)?\n",  # YAML of an export
         rb"(?:%YAML:1\.0\n---\n)?# MARK\n(?:image_width|cam0):",  # YAML of a calibration
         rb"(?:%YAML:1\.0\n---\n)?##? MARK\n(?:object_points|target_type|# point)",  # a board for another program
         rb"999\nMARK\n",  # DXF

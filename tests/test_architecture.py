@@ -48,6 +48,7 @@ GROUND = {
     "workers": ["errors", "signals"],
     "seeds": [],
     "opencv": ["errors"],
+    "provenance": [],
 }
 """What every stage shares, and what each of these modules may import."""
 ROOMS = {
@@ -58,10 +59,10 @@ ROOMS = {
     "printing": ["geometry", "patches"],
     "render": ["geometry", "patches", "camera"],
     "degrade": ["geometry"],
-    "dataset": ["geometry"],
-    "synth": ["geometry", "camera", "patches", "render", "degrade", "dataset"],
-    "analysis": ["geometry", "camera", "patches", "printing", "render"],
     "predictions": [],
+    "dataset": ["geometry", "predictions"],
+    "synth": ["geometry", "camera", "patches", "render", "degrade", "predictions", "dataset"],
+    "analysis": ["geometry", "camera", "patches", "printing", "render"],
     "scoring": ["geometry"],
     "report": ["scoring"],
     "fitting": ["geometry", "patches"],

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 from helpers import kpbench
 
-from kpbench.benchmark import bench, count_bench_images
+from kpbench.benchmark.run import bench, count_bench_images
+from kpbench.dataset.export import export_dataset
 from kpbench.detectors import interface as detect
 from kpbench.detectors.interface import load_detector
 from kpbench.errors import DataError
@@ -86,8 +87,8 @@ def test_interrupted_at_three_places_and_resumed_is_the_same(here):
 
 def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, monkeypatch):
     bench([SMALL], ["mine:corners"], "out", workers=1)
-    monkeypatch.setattr("kpbench.benchmark.detect_images", lambda *a: pytest.fail("looked again"))
-    monkeypatch.setattr("kpbench.benchmark.generate", lambda *a, **k: pytest.fail("made again"))
+    monkeypatch.setattr("kpbench.benchmark.detection.detect_images", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.run.generate", lambda *a, **k: pytest.fail("made again"))
     bench([SMALL], ["mine:corners"], "out", workers=1)
     commented = DETECTOR + "# another comment\n"
     for source, again in [(commented, False), (DETECTOR.replace('version = "1"', 'version = "2"'), True)]:
@@ -99,7 +100,7 @@ def test_what_is_done_is_not_done_again_unless_the_detector_is_another(here, mon
 
 def test_a_detector_without_a_version_looks_again_each_time(here, monkeypatch):
     bench([SMALL], ["mine:frail"], "out", workers=1)
-    monkeypatch.setattr("kpbench.benchmark.detect_images", lambda *a: pytest.fail("looked again"))
+    monkeypatch.setattr("kpbench.benchmark.detection.detect_images", lambda *a: pytest.fail("looked again"))
     with pytest.raises(pytest.fail.Exception, match="looked again"):
         bench([SMALL], ["mine:frail"], "out", workers=1)
 
@@ -220,3 +221,31 @@ def test_a_folder_of_other_files_is_left_alone(here):
     refused = kpbench("demo", "--n", 1, "--out", "photos", code=1)
     assert "photos: holds other files (scores.json, ...), expected a new or an empty folder" in refused.output
     assert [path.name for path in (here / "photos").iterdir()] == ["scores.json"]
+
+
+def test_a_dataset_is_benched_as_a_suite_is(here, dataset, monkeypatch):
+    arguments = ["bench", "--dataset", dataset.path, "--detector", "mine:corners", "--workers", 1, "--out", "out"]
+    done = kpbench(*arguments)
+    assert "out/set.html: the report of set" in done.stdout
+    assert "<title>set, simulated</title>" in (here / "out/set.html").read_text()
+    scores = json.loads((here / "out/scores/set/mine-corners.json").read_text())
+    assert scores["provenance"]["dataset"]["source"] == "simulated"
+    kpbench("detect", dataset.path, "--detector", "mine:corners", "--out", "preds.json")
+    kpbench("score", "preds.json", "--json", "own.json")
+    assert scores["metrics"] == json.loads((here / "own.json").read_text())["metrics"]
+    monkeypatch.setattr("kpbench.benchmark.detection.detect_images", lambda *a: pytest.fail("looked again"))
+    kpbench(*arguments)
+    refused = kpbench("bench", "--dataset", dataset.path, "--detector", "aruco", "--out", "out", code=1)
+    assert "shows patches, but aruco looks for the board aruco" in refused.stderr
+    for option in (["--quick"], ["--suite", "paper-v1"], ["--images", "3"]):
+        kpbench("bench", "--dataset", dataset.path, *option, code=2)
+
+
+def test_the_images_of_annotations_are_looked_at_each_time(here, dataset, monkeypatch):
+    folder = export_dataset(dataset, "coco", here / "labels").parent
+    for path in (folder, folder / "annotations.json"):
+        kpbench("bench", "--dataset", path, "--detector", "orb", "--workers", 1, "--out", "out")
+        assert "<title>labels, simulated</title>" in (here / "out/labels.html").read_text()
+    monkeypatch.setattr("kpbench.benchmark.detection.detect_images", lambda *a: pytest.fail("looked again"))
+    with pytest.raises(pytest.fail.Exception, match="looked again"):
+        kpbench("bench", "--dataset", folder, "--detector", "orb", "--workers", 1, "--out", "out")

@@ -32,7 +32,7 @@ def test_a_file_scores_as_its_predictions_and_every_file_is_written(here):
     assert content["provenance"] == scored.provenance
     assert content["provenance"]["command"] == "my script"
     assert "my script" in (here / "r.html").read_text()
-    assert (here / "s.csv").read_text().startswith("schema,detector,dataset,kpbench,condition")
+    assert (here / "s.csv").read_text().startswith("schema,detector,dataset,source,kpbench,condition")
     assert scored.poses == ()
 
 
@@ -48,7 +48,11 @@ def test_the_truth_may_be_a_path_an_open_dataset_or_a_class_of_ones_own(here):
     write_predictions("none.json", Predictions.from_detections([Detections.none()] * 3))
     messages = []
     scored = score_file("none.json", Mine(), report_file="r.html", warn=messages.append)
-    assert scored.provenance["dataset"] == {"path": str(here / "mine"), "fingerprint": "0" * 64}
+    assert scored.provenance["dataset"] == {
+        "path": str(here / "mine"),
+        "fingerprint": "0" * 64,
+        "source": None,
+    }
     assert messages == ["r.html shows no images: the photographs are elsewhere"]
     assert score_file("p.json", dataset).dataset is dataset
 

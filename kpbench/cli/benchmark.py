@@ -12,8 +12,11 @@ from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, WORKERS
 
 
 @click.command()
+@click.option("--suite", "suites", multiple=True, help="Suite to run; repeatable. Default: paper-v1.")
 @click.option(
-    "--suite", "suites", multiple=True, default=["paper-v1"], show_default=True, help="Suite to run; repeatable."
+    "--dataset",
+    type=click.Path(path_type=Path),
+    help="Labelled images to run instead of suites: a dataset, COCO annotations (.json), or a folder with both.",
 )
 @click.option(
     "--detector",
@@ -45,6 +48,7 @@ from kpbench.cli.options import BACKGROUNDS, ONLY, SEED, SIZE, WORKERS
 @WORKERS
 def bench(
     suites: tuple[str, ...],
+    dataset: Path | None,
     detectors: tuple[str, ...],
     out: Path,
     quick: bool,
@@ -57,6 +61,8 @@ def bench(
 ) -> None:
     """Make the suites, run the detectors, and compare the scores with the paper's scores.
 
+    With --dataset, the detectors run over labelled images of your own, such as photographs, and their tables come out.
+
     Detectors of tags get boards of tags in the same scenes. The same command continues an interrupted run. The command
     prints tables as Markdown. It also writes a report per suite, and the scores and predictions of each detector.
 
@@ -65,10 +71,13 @@ def bench(
       kpbench bench --quick
       kpbench bench --quick --suite paper-v1 --suite extended-v1 --detector template --detector aruco
       kpbench bench --images 50 --detector my_module:MyDetector --only blur
+      kpbench bench --dataset degraded --detector superpoint-small
     """
-    from kpbench.benchmark import bench as run_bench
-    from kpbench.benchmark import count_bench_images, write_suite_reports
+    from kpbench.benchmark.reports import write_suite_reports
+    from kpbench.benchmark.run import bench as run_bench
+    from kpbench.benchmark.run import bench_dataset, count_bench_images
     from kpbench.cli.progress import progress_bar
+    from kpbench.dataset.labelled import open_labelled
     from kpbench.report.tables import to_markdown
     from kpbench.synth.suite import SuiteConfig
     from kpbench.synth.suite_file import load_suite
@@ -77,13 +86,19 @@ def bench(
         raise click.UsageError("--quick already sets --images and --size; drop --quick, or drop --images and --size")
     if quick:
         images, size = 20, (640, 480)
-    loaded = [load_suite(name) for name in suites]
+    if dataset is not None and (suites or images or size or only or seed or backgrounds):
+        raise click.UsageError("--dataset takes --detector, --out and --workers, and no option of a suite")
+    loaded = [load_suite(name) for name in suites or ("paper-v1",)]
     if len({suite.name for suite in loaded}) < len(loaded):
         raise click.UsageError(f"two suites have the same name: {', '.join(s.name for s in loaded)}")
     configs = [SuiteConfig(suite, images, seed, size, only, backgrounds) for suite in loaded]
     try:
-        with progress_bar(count_bench_images(configs, detectors), "bench") as progress:
-            runs = run_bench(configs, detectors, out, workers=workers, progress=progress)
+        if dataset is not None:
+            with progress_bar(len(open_labelled(dataset)) * len(detectors), "bench") as progress:
+                runs = bench_dataset(dataset, detectors, out, workers=workers, progress=progress)
+        else:
+            with progress_bar(count_bench_images(configs, detectors), "bench") as progress:
+                runs = run_bench(configs, detectors, out, workers=workers, progress=progress)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("finished work is kept; the same command continues the run") from None
     for report in write_suite_reports(runs, out, command=["kpbench", *sys.argv[1:]]):
@@ -94,6 +109,6 @@ def bench(
     failed = [(run, failure) for run in runs for failure in run.failures]
     if failed:
         for run, (image_id, problem) in failed[:5]:
-            print_warning(f"{run.scores.name} on {run.config.name}: image_id {image_id}: {problem}")
+            print_warning(f"{run.scores.name} on {run.suite}: image_id {image_id}: {problem}")
         print_warning(f"detectors failed on {len(failed)} images, which count as no detections")
         raise SystemExit(1)

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from kpbench.cli.messages import echo
+from kpbench.cli.options import Finite
 
 DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Path("kpbench-data"))
 
@@ -16,14 +17,16 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path), default=Pat
 def inspect(dataset: Path) -> None:
     """Print facts about a dataset, and histograms of its keypoints.
 
+    DATASET may also be COCO annotations (.json), or a folder with annotations.json.
+
     \b
     Examples:
       kpbench inspect kpbench-data
     """
     from kpbench.dataset.card import dataset_facts, dataset_histograms
-    from kpbench.dataset.folder import open_dataset
+    from kpbench.dataset.labelled import open_labelled
 
-    data = open_dataset(dataset)
+    data = open_labelled(dataset)
     echo(f"{'dataset':12} {data.path}")
     for name, value in dataset_facts(data).items():
         echo(f"{name:12} {value}")
@@ -64,17 +67,20 @@ def verify(dataset: Path) -> None:
 def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
     """Draw a contact sheet of evenly spaced images with their true keypoints.
 
+    DATASET may also be COCO annotations (.json), or a folder with annotations.json.
+
     \b
     Examples:
+      kpbench preview photos/annotations.json --out labels.png
       kpbench preview kpbench-data --count 20 --columns 5
     """
     from kpbench.dataset.card import draw_overview
-    from kpbench.dataset.folder import open_dataset
+    from kpbench.dataset.labelled import open_labelled
     from kpbench.images import encode_png
     from kpbench.writing import require_writable, write_file
 
-    data = open_dataset(dataset)
-    target = out or data.path / "preview.png"
+    data = open_labelled(dataset)
+    target = out or (data.path.parent if data.path.suffix == ".json" else data.path) / "preview.png"
     require_writable(target, "picture")
     write_file(target, encode_png(draw_overview(data, count, columns, tile_width), "picture"))
     echo(target)
@@ -86,22 +92,32 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     "--format", "file_format", type=click.Choice(["coco", "yolo", "webdataset"]), required=True, help="Format to write."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="New folder to write into. Default: DATASET-FORMAT.")
-def export(dataset: Path, file_format: str, out: Path | None) -> None:
+@click.option(
+    "--val-share",
+    type=Finite(0, 1, max_open=True),
+    default=0.2,
+    show_default=True,
+    help="yolo: share of the scenes that are for validation.",
+)
+def export(dataset: Path, file_format: str, out: Path | None, val_share: float) -> None:
     """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
+
+    DATASET may also be COCO annotations (.json), or a folder with annotations.json.
 
     \b
     Examples:
       kpbench export kpbench-data --format coco
-      kpbench export val --format yolo --out val-yolo
+      kpbench export val --format yolo --val-share 0.1 --out val-yolo
+      kpbench export kpbench-data-coco --format webdataset
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.export import UNFINISHED, export_dataset
-    from kpbench.dataset.folder import open_dataset
+    from kpbench.dataset.labelled import open_labelled
 
-    data, target = open_dataset(dataset), out or Path(f"{dataset}-{file_format}")
+    data, target = open_labelled(dataset), out or Path(f"{dataset}-{file_format}")
     try:
         with progress_bar(len(data), "export") as progress:
-            echo(export_dataset(data, file_format, target, progress))
+            echo(export_dataset(data, file_format, target, progress, val_share))
     except KeyboardInterrupt:
         is_finished = (target / "README.md").exists() and not (target / UNFINISHED).exists()
         message = "the export is finished" if is_finished else "the same command continues the export"

@@ -3,29 +3,48 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
 from kpbench.cli.messages import echo
-from kpbench.cli.options import FINITE, SEED
+from kpbench.cli.options import FINITE, ONLY, SEED, WORKERS
 
 
 @click.command()
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option(
-    "--effect", "effects", multiple=True, required=True, help="Effect; repeatable. Effects are applied in this order."
-)
-@click.option(
-    "--level", "levels", type=FINITE, multiple=True, required=True, help="Level of the effect; one for each --effect."
-)
+@click.option("--effect", "effects", multiple=True, help="Effect; repeatable. Effects are applied in this order.")
+@click.option("--level", "levels", type=FINITE, multiple=True, help="Level of the effect; one for each --effect.")
+@click.option("--suite", metavar="NAME|FILE", help="Suite whose artificial conditions degrade a labelled dataset.")
+@ONLY
+@click.option("--channels", type=int, default=1, show_default=True, help="With --suite: 1 for grey images, 3 for RGB.")
 @click.option(
     "--out", type=click.Path(path_type=Path), default=Path("degraded"), show_default=True, help="Folder to write into."
 )
 @SEED
-def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
-    """Degrade an image, or all images of a folder, and write them as PNG.
+@WORKERS
+@click.option("--resume", is_flag=True, help="With --suite: keep the finished shards of an interrupted run.")
+@click.option("--overwrite", is_flag=True, help="With --suite: delete the dataset in the folder first.")
+def degrade(
+    source: Path,
+    effects: tuple[str, ...],
+    levels: tuple[float, ...],
+    suite: str | None,
+    only: tuple[str, ...],
+    channels: int,
+    out: Path,
+    seed: int,
+    **run: Any,
+) -> None:
+    """Degrade a labelled dataset with --suite, or images and folders of images with --effect.
 
-    The command prints one line per image: the written file, then the applied effects as JSON.
+    With --suite, SOURCE is a dataset, COCO annotations (.json) or a folder with annotations.json. The command writes a
+    dataset: the images as they are, then under each rung of the suite's conditions that consist of effects alone. In
+    paper-v1, these are blur, dimming and noise. They are applied to images without a rung, and to images of the rungs
+    that the paper degraded: 16 of scale and 0 of pitch.
+
+    With --effect, the command writes PNG files, and prints one line per image: the written file, then the applied
+    effects as JSON.
 
     \b
     Effects and their rungs in the suites:
@@ -38,7 +57,33 @@ def degrade(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], o
     Examples:
       kpbench degrade photo.jpg --effect blur --level 7
       kpbench degrade photos/ --effect motion-blur --level 20 --effect noise --level 15 --out worn
+      kpbench degrade labelled --suite paper-v1 --out degraded
+      kpbench degrade photos/annotations.json --suite extended-v1 --only jpeg,defocus --out degraded
     """
+    if suite is not None:
+        if effects or levels:
+            raise click.UsageError("--suite and --effect exclude each other")
+        _degrade_dataset(source, suite, only, channels, out, seed, run)
+        return
+    if only or any(run.values()) or not effects:
+        raise click.UsageError("expected --suite NAME for a dataset, or --effect and --level for images")
+    _degrade_images(source, effects, levels, out, seed)
+
+
+def _degrade_dataset(
+    source: Path, suite: str, only: tuple[str, ...], channels: int, out: Path, seed: int, run: dict[str, Any]
+) -> None:
+    from kpbench.cli.synth import write_dataset
+    from kpbench.images import refuse_same_folder
+    from kpbench.synth.degraded import DegradeConfig
+    from kpbench.synth.suite_file import load_suite
+
+    refuse_same_folder(source, out)
+    config = DegradeConfig(source, load_suite(suite), only, seed, channels)
+    write_dataset(config, out, "degrade", engine="local", scheduler=None, shard_range=None, **run)
+
+
+def _degrade_images(source: Path, effects: tuple[str, ...], levels: tuple[float, ...], out: Path, seed: int) -> None:
     import json
 
     from kpbench.cli.progress import progress_bar

@@ -33,7 +33,7 @@ def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path
     from kpbench.files import require_own_folder
     from kpbench.writing import require_writable
 
-    require_own_folder(out, "print", "the demo")
+    require_own_folder(out, ["print"], "the demo")
     load_detector(detector)  # which fails before the images are made, if it fails
     data, preds = out / "data", out / "preds.json"
     for file, kind in ((preds, "predictions"), (out / "contact-sheet.png", "picture"), (out / "scores.json", "scores")):

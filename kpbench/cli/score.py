@@ -120,6 +120,7 @@ def score(
     """
     from kpbench.boards.pose_files import holds_poses
     from kpbench.evaluate import score_file
+    from kpbench.provenance import image_source
     from kpbench.report.summary import summarise_scores
     from kpbench.scoring.scores import check_gates
 
@@ -129,7 +130,8 @@ def score(
     scored = score_file(preds, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
     scores, dataset = scored.scores, scored.dataset
     echo(f"predictions  {preds}{f', {scores.name}' if scores.detector else ''}")
-    echo(f"dataset      {dataset.path}, fingerprint {dataset.fingerprint[:16]}")
+    source = image_source(dataset.config)
+    echo(f"dataset      {dataset.path}, {f'{source}, ' if source else ''}fingerprint {dataset.fingerprint[:16]}")
     echo(summarise_scores(scores, scored.poses), lines=True)
     check_gates(scores, dict(least), dict(most))
 

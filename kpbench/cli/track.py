@@ -55,14 +55,18 @@ def track(
     from kpbench.cli.progress import progress_bar
     from kpbench.dataset.folder import Dataset
     from kpbench.detectors.sources import open_source
+    from kpbench.errors import DataError
     from kpbench.geometry.camera_file import read_camera
     from kpbench.patches.board_file import load_boards
+    from kpbench.predictions.coco import CocoDataset
     from kpbench.synth.suite_boards import film_board
     from kpbench.tracking.films import track_images
     from kpbench.tracking.tracker import Tracker
 
     require_poses_path(poses)
     images = open_source(source, overlay=overlay)
+    if isinstance(images, CocoDataset):
+        raise DataError(f"{source}: COCO annotations, expected a film, images, or a dataset of films")
     own = film_board(images.config) if isinstance(images, Dataset) else None
     for given, option in ((board, "--board"), (camera, "--camera")):
         if given is None and own is None:

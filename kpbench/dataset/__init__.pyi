@@ -13,6 +13,8 @@ from .generation import GenerationResult as GenerationResult
 from .generation import generate as generate
 from .generation import generate_part as generate_part
 from .generation import merge as merge
+from .labelled import open_labelled as open_labelled
 from .shard import Sample as Sample
+from .splits import split_scenes as split_scenes
 
 __all__: list[str]

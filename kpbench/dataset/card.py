@@ -11,8 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from kpbench.dataset.drawing import contact_sheet, draw_keypoints
 from kpbench.dataset.folder import Dataset
+from kpbench.dataset.usage import DATASET_USAGE
 from kpbench.files import encode_utf8
 from kpbench.images import encode_png
+from kpbench.predictions.coco import CocoDataset
+from kpbench.provenance import describe_images, image_source
 from kpbench.text import escape_markdown
 from kpbench.types import Float, UInt8
 from kpbench.writing import is_replaceable, write_file
@@ -21,6 +24,16 @@ CARD_FILES = ("README.md", "preview.png")
 """The files that :func:`write_card` writes: the card and its picture."""
 CARD_MARK = "kpbench.card/1"
 """Mark of a card that kpbench wrote. A card without the mark is the user's."""
+LICENCES = {
+    "simulated": (
+        "The images are simulated by kpbench. Configuration and background files determine every image.\n"
+        "If the background files are photographs, their licence also holds for these images."
+    ),
+    "simulated photographs": "The images are simulated by kpbench, and labelled as photographs are.",
+    "photographs": "The images are photographs. The licence of the photographs holds for them.",
+    "": "Nothing tells what the images are. The licence of the originals holds for them.",
+}
+"""What a card says of the images, by what :func:`kpbench.provenance.image_source` returns."""
 SIZE_CATEGORIES = (
     (10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "100K<n<1M"), (10**7, "1M<n<10M"),
 )  # fmt: skip
@@ -56,14 +69,14 @@ class Histogram:
         return self.counts / max(int(self.counts.sum()), 1)
 
 
-def patch_names(dataset: Dataset) -> dict[int, str]:
+def patch_names(dataset: Dataset | CocoDataset) -> dict[int, str]:
     """Return the name of every patch ID. An ID without a name in the dataset's config gets the name ``patch-ID``."""
     known = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
     ids = sorted({*known, *dataset.truth.keypoints["patch_id"]})
     return {int(patch_id): known.get(int(patch_id), f"patch-{patch_id}") for patch_id in ids}
 
 
-def dataset_facts(dataset: Dataset) -> dict[str, str]:
+def dataset_facts(dataset: Dataset | CocoDataset) -> dict[str, str]:
     """Return facts about the whole dataset, as a mapping from names to texts.
 
     Examples
@@ -74,10 +87,9 @@ def dataset_facts(dataset: Dataset) -> dict[str, str]:
     '6 of 640x480, grey'
     """
     image, config, keypoints = dataset.image(0), dataset.config, dataset.truth.keypoints
-    size = sum(shard.bytes for shard in dataset.shards)
-    sources = [f"{config.get('backgrounds', {}).get('kind', 'n/a')} backgrounds"]
-    if "source" in config:
-        sources = [str(config["source"])]
+    sources = [f"seed {config['seed']}"] if "seed" in config else []
+    if "backgrounds" in config:
+        sources.append(f"{config['backgrounds'].get('kind', 'n/a')} backgrounds")
     if "deteriorate" in config:
         sources.append(f"deterioration {config['deteriorate']}")
     if "limits" in config:
@@ -86,18 +98,28 @@ def dataset_facts(dataset: Dataset) -> dict[str, str]:
         sources.append(f"up to {config['distractors']} look-alikes an image")
     if config.get("augmentation"):
         sources.append("an albumentations pipeline (in dataset.json)")
+    if config.get("kind") == "degraded":
+        sources.append(f"effects of {config['suite']} on the images of {config['of']['fingerprint'][:16]}")
     designs = [f"{patch['name']} ({patch['id']})" for patch in config.get("patches", [])]
     return {
         "fingerprint": dataset.fingerprint,
         "images": f"{len(dataset)} of {image.shape[1]}x{image.shape[0]}, {'grey' if image.ndim == 2 else 'RGB'}",
-        "on disk": f"{size / 1e6:.1f} MB in {len(dataset.shards)} shards, {size / len(dataset) / 1e3:.1f} kB an image",
-        "made from": ", ".join([*([f"seed {config['seed']}"] if "seed" in config else []), *sources]),
+        "source": image_source(config) or "n/a",
+        **_disk_facts(dataset),
+        "made from": ", ".join(sources) or "n/a",
         "designs": ", ".join(designs) or "n/a",
         "keypoints": f"{len(keypoints)}",
     }
 
 
-def dataset_histograms(dataset: Dataset) -> list[Histogram]:
+def _disk_facts(dataset: Dataset | CocoDataset) -> dict[str, str]:
+    if not isinstance(dataset, Dataset):
+        return {}
+    size, shards = sum(shard.bytes for shard in dataset.shards), len(dataset.shards)
+    return {"on disk": f"{size / 1e6:.1f} MB in {shards} shards, {size / len(dataset) / 1e3:.1f} kB an image"}
+
+
+def dataset_histograms(dataset: Dataset | CocoDataset) -> list[Histogram]:
     """Return histograms: keypoints per image, patch IDs, sizes, tilts, contrasts and visible fractions.
 
     Examples
@@ -139,12 +161,12 @@ def _bin_values(title: str, values: ArrayLike, borders: list[float]) -> Histogra
     return Histogram(title, labels, np.histogram(np.asarray(values), borders)[0])
 
 
-def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int) -> UInt8:
+def draw_overview(dataset: Dataset | CocoDataset, count: int, columns: int, tile_width_px: int) -> UInt8:
     """Draw a contact sheet of evenly spaced images with their true keypoints.
 
     Parameters
     ----------
-    dataset : Dataset
+    dataset : Dataset or CocoDataset
     count : int
         Number of images.
     columns : int
@@ -165,14 +187,22 @@ def draw_overview(dataset: Dataset, count: int, columns: int, tile_width_px: int
     (252, 332, 3)
     """
     chosen = np.unique(np.linspace(0, len(dataset) - 1, min(count, len(dataset))).astype(int)).tolist()
-    scale = tile_width_px / dataset.image(0).shape[1]
-    return contact_sheet([draw_keypoints(*dataset[n], scale) for n in chosen], min(columns, len(chosen)))
+    shown = (dataset[n] for n in chosen)
+    tiles = [draw_keypoints(image, keypoints, tile_width_px / image.shape[1]) for image, keypoints in shown]
+    return contact_sheet(tiles, min(columns, len(chosen)))
 
 
-def write_card(dataset: Dataset, folder: Path) -> None:
+def write_card(dataset: Dataset | CocoDataset, folder: Path, usage: str = DATASET_USAGE) -> None:
     """Write the dataset card into a folder: ``README.md`` with the header that dataset hubs read, and ``preview.png``.
 
     A file that kpbench did not write is not replaced.
+
+    Parameters
+    ----------
+    dataset : Dataset or CocoDataset
+    folder : Path
+    usage : str
+        Markdown that tells how the folder is used.
 
     Raises
     ------
@@ -188,18 +218,20 @@ def write_card(dataset: Dataset, folder: Path) -> None:
         return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))
     facts = "\n".join(f"| {key} | {escape_markdown(value)} |" for key, value in dataset_facts(dataset).items())
-    versions = ", ".join(
-        escape_markdown(f"{name} {version}") for name, version in dataset.provenance.get("versions", {}).items()
-    )
+    versions = {} if not isinstance(dataset, Dataset) else dataset.provenance.get("versions", {})
+    made_with = ", ".join(escape_markdown(f"{name} {version}") for name, version in versions.items())
+    source = image_source(dataset.config)
+    tags = ", ".join(["keypoint-patches", *([source] if source else [])])
+    images = describe_images(len(dataset), source)
     text = f"""---
-pretty_name: Keypoint patches, {len(dataset)} images
+pretty_name: Keypoint patches, {images}
 task_categories: [keypoint-detection]
 size_categories: ["{_size_category(len(dataset))}"]
-tags: [keypoint-patches, simulated]
+tags: [{tags}]
 ---
 
 <!-- {CARD_MARK}: kpbench replaces this file as long as this line stands in it -->
-# Keypoint patches, {len(dataset)} simulated images
+# Keypoint patches, {images}
 
 ![Evenly spaced images with their true keypoints](preview.png)
 
@@ -207,19 +239,11 @@ tags: [keypoint-patches, simulated]
 |---|---|
 {facts}
 
-The images are simulated by kpbench. The configuration in `dataset.json` and the background files determine every image.
-If the background files are photographs, their licence also holds for these images.
+{LICENCES[source]}
 
-```python
-import kpbench
-
-image, keypoints = kpbench.open_dataset("path/of/this/folder")[0]
-```
-
+{usage}
 {tables}
-
-Made with {versions}.
-"""
+{f"{chr(10)}Made with {made_with}.{chr(10)}" if made_with else ""}"""
     write_file(folder / card, encode_utf8(text))
 
 

@@ -103,7 +103,7 @@ def draw_detections(image: UInt8, detections: Detections) -> UInt8:
 
 
 def contact_sheet(tiles: Sequence[UInt8], columns: int, gap_px: int = 4) -> UInt8:
-    """Arrange tiles of equal size in rows on a white sheet.
+    """Arrange tiles in rows on a white sheet. Each cell of the sheet has the size of the largest tile.
 
     Parameters
     ----------
@@ -119,10 +119,10 @@ def contact_sheet(tiles: Sequence[UInt8], columns: int, gap_px: int = 4) -> UInt
     ndarray of shape (H_sheet, W_sheet, 3), uint8
         RGB.
     """
-    height, width = tiles[0].shape[:2]
+    height, width = (max(tile.shape[axis] for tile in tiles) for axis in (0, 1))
     rows = -(-len(tiles) // columns)
     sheet = np.full((rows * (height + gap_px) + gap_px, columns * (width + gap_px) + gap_px, 3), 255, np.uint8)
     for n, tile in enumerate(tiles):
         y, x = gap_px + n // columns * (height + gap_px), gap_px + n % columns * (width + gap_px)
-        sheet[y : y + height, x : x + width] = tile
+        sheet[y : y + tile.shape[0], x : x + tile.shape[1]] = tile
     return sheet

@@ -6,10 +6,12 @@ coordinates of YOLO, the origin is the top-left corner of this pixel, half a pix
 
 from __future__ import annotations
 
+import hashlib
 import io
 import json
 import tarfile
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +20,16 @@ from numpy.typing import NDArray
 
 from kpbench.dataset.card import patch_names, write_card
 from kpbench.dataset.folder import Dataset
+from kpbench.dataset.splits import SPLITS, VAL_SHARE, split_scenes
+from kpbench.dataset.usage import EXPORT_USAGE
 from kpbench.errors import DataError
 from kpbench.files import escape_surrogates, make_folder
 from kpbench.geometry.homography import project_disc_boxes
 from kpbench.images import encode_png
 from kpbench.locks import LOCK_FILE, lock_folder
+from kpbench.portable import cos_sin
+from kpbench.predictions.coco import CocoDataset
+from kpbench.provenance import image_source
 from kpbench.text import escape_yaml
 from kpbench.types import KEYPOINT_DTYPE, Float
 from kpbench.workers import Progress
@@ -32,23 +39,32 @@ EXPORT_MARK = "kpbench.export/1"
 """Mark in the main file of an export to COCO or YOLO."""
 IMAGE_KIND = "exported-image"
 """Kind of the exported images."""
+IMAGES_PER_TAR = 500
+"""Images per tar of an export to WebDataset, where the dataset has no shards."""
 UNFINISHED = ".kpbench-unfinished"
 """File that stands in the folder of an export until the export is finished. The same export then continues."""
 
 
 def export_dataset(
-    dataset: Dataset, file_format: str, out: str | Path, progress: Progress = lambda images: None
+    dataset: Dataset | CocoDataset,
+    file_format: str,
+    out: str | Path,
+    progress: Progress = lambda images: None,
+    val_share: float = VAL_SHARE,
 ) -> Path:
     """Write a dataset in another format into a new or empty folder, with the dataset's card.
 
     Parameters
     ----------
-    dataset : Dataset
+    dataset : Dataset or CocoDataset
+        See :func:`kpbench.dataset.open_labelled`.
     file_format : {"coco", "yolo", "webdataset"}
     out : str or Path
         Folder; made if missing.
     progress : callable
         Called with the number of images written since its last call.
+    val_share : float
+        Share of the scenes that are for validation, see :func:`kpbench.dataset.split_scenes`. Only "yolo" splits.
 
     Returns
     -------
@@ -70,25 +86,37 @@ def export_dataset(
     if file_format not in EXPORT_FORMATS:
         raise DataError(f"`file_format` is {file_format!r}, expected one of: {', '.join(EXPORT_FORMATS)}")
     folder = Path(out)
-    mark, content = folder / UNFINISHED, f"{EXPORT_MARK} {file_format} {dataset.fingerprint}\n".encode()
+    share = f"{val_share:g}" if file_format == "yolo" else ""
+    digest = hashlib.sha256(f"{dataset.fingerprint} {share}".encode()).hexdigest()
+    mark, content = folder / UNFINISHED, f"{EXPORT_MARK} {file_format} {digest}\n".encode()
     if folder.is_dir() and any(path.name != LOCK_FILE for path in folder.iterdir()):
         if not mark.is_file():
             raise DataError(f"{folder}: is not empty; name a new folder as `out`")
         if mark.read_bytes() != content:
             raise DataError(f"{folder}: holds another unfinished export; name a new folder as `out`")
+    splits = split_scenes(dataset.truth, val_share) if file_format == "yolo" else []
     with lock_folder(make_folder(folder)):
         for part in filter(is_leftover, folder.rglob(".*.part")):  # of a killed run
             part.unlink()
-        require_space(folder, sum(shard.bytes for shard in dataset.shards), f"{len(dataset)} images")
+        require_space(folder, _expected_bytes(dataset), f"{len(dataset)} images")
         write_file(mark, content)
-        main_file = EXPORT_FORMATS[file_format](dataset, folder, progress)
-        write_card(dataset, folder)
+        main_file = EXPORT_FORMATS[file_format](dataset, folder, progress, splits)
+        write_card(dataset, folder, EXPORT_USAGE[file_format])
         remove_file(mark, "export")
     return main_file
 
 
+def _expected_bytes(dataset: Dataset | CocoDataset) -> int:
+    """Return about how many bytes the images of a dataset need."""
+    if isinstance(dataset, Dataset):
+        return sum(shard.bytes for shard in dataset.shards)
+    return len(dataset) * dataset.image(0).nbytes // 2
+
+
 def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
     """Return the bounding boxes of the projected discs, clipped to the image.
+
+    The ellipse of a disc follows from ``H_patch2image``. Where that is zero, unknown, it follows from its semi-axes.
 
     Returns
     -------
@@ -96,12 +124,19 @@ def _disc_boxes(keypoints: NDArray[Any], width: int, height: int) -> Float:
         x, y, width and height, px. The origin is the top-left corner of the top-left pixel.
     """
     centre, half_size = project_disc_boxes(keypoints["H_patch2image"])
+    unknown = ~keypoints["H_patch2image"].any(axis=(1, 2))
+    if unknown.any():
+        k = keypoints[unknown]
+        c, s = (np.square(v) for v in cos_sin(np.radians(k["axis_angle"].astype(np.float64))))
+        major, minor = (np.square(k[name].astype(np.float64)) for name in ("radius_major", "radius_minor"))
+        centre[unknown] = np.column_stack([k["x"], k["y"]])
+        half_size[unknown] = np.sqrt(np.column_stack([major * c + minor * s, major * s + minor * c]))
     low = np.clip(centre - half_size + 0.5, 0, [width, height])
     high = np.clip(centre + half_size + 0.5, 0, [width, height])
     return np.hstack([low, high - low])
 
 
-def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
+def _export_coco(dataset: Dataset | CocoDataset, folder: Path, progress: Progress, splits: list[str]) -> Path:
     """Write COCO keypoints. Each design is a category with one keypoint. Annotations also hold kpbench's columns."""
     make_folder(folder / "images")
     images: list[dict[str, Any]] = []
@@ -140,12 +175,14 @@ def _export_coco(dataset: Dataset, folder: Path, progress: Progress) -> Path:
     ]
     # `kpbench score` compares this fingerprint with the fingerprint in the predictions
     info = {"description": f"kpbench dataset ({EXPORT_MARK})", "fingerprint": dataset.fingerprint}
+    if source := image_source(dataset.config):
+        info["source"] = source
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
     write_file(folder / "annotations.json", json.dumps(content).encode())
     return folder / "annotations.json"
 
 
-def _scoring_groups(dataset: Dataset, n: int) -> dict[str, Any]:
+def _scoring_groups(dataset: Dataset | CocoDataset, n: int) -> dict[str, Any]:
     """Return the groups of image n for scoring: the base scene, and for a suite the condition and the rung."""
     truth = dataset.truth
     scene = {"scene_id": int(truth.scene_id[n])}
@@ -154,10 +191,11 @@ def _scoring_groups(dataset: Dataset, n: int) -> dict[str, Any]:
     return {"condition": str(truth.condition[n]), "rung": float(truth.rung[n]), **scene}
 
 
-def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
+def _export_yolo(dataset: Dataset | CocoDataset, folder: Path, progress: Progress, splits: list[str]) -> Path:
     """Write YOLO-pose: one text file per image, with lengths as fractions of the image's width or height."""
-    for name in ("images", "labels"):
-        make_folder(folder / name)
+    for split in {*splits}:
+        for name in ("images", "labels"):
+            make_folder(folder / name / split)
     ids = dataset.truth.image_id
     names = patch_names(dataset)
     classes = {patch_id: n for n, patch_id in enumerate(names)}
@@ -169,23 +207,27 @@ def _export_yolo(dataset: Dataset, folder: Path, progress: Progress) -> Path:
             numbers = [(x + w / 2) / width, (y + h / 2) / height, w / width, h / height]
             numbers += [(k["x"] + 0.5) / width, (k["y"] + 0.5) / height]
             lines.append(f"{classes[int(k['patch_id'])]} {' '.join(f'{v:.9f}' for v in numbers)} 2\n")
-        write_file(folder / "images" / f"{ids[n]:08d}.png", encode_png(image, IMAGE_KIND))
-        write_file(folder / "labels" / f"{ids[n]:08d}.txt", "".join(lines).encode())
+        write_file(folder / "images" / splits[n] / f"{ids[n]:08d}.png", encode_png(image, IMAGE_KIND))
+        write_file(folder / "labels" / splits[n] / f"{ids[n]:08d}.txt", "".join(lines).encode())
         progress(1)
     listing = "".join(f"  {classes[patch_id]}: {escape_yaml(name)}\n" for patch_id, name in names.items())
     # without a key `path`, YOLO looks for the folders beside this file
-    text = f"# {EXPORT_MARK}\ntrain: images\nval: images\nkpt_shape: [1, 3]\nnames:\n{listing}"
+    train, val = (f"images/{split if split in splits else SPLITS[0]}" for split in SPLITS)
+    text = f"# {EXPORT_MARK}\ntrain: {train}\nval: {val}\nkpt_shape: [1, 3]\nnames:\n{listing}"
     write_file(folder / "data.yaml", text.encode())
     return folder / "data.yaml"
 
 
-def _export_webdataset(dataset: Dataset, folder: Path, progress: Progress) -> Path:
+def _export_webdataset(dataset: Dataset | CocoDataset, folder: Path, progress: Progress, splits: list[str]) -> Path:
     """Write WebDataset: one tar per shard, with a PNG and a JSON per image. Equal datasets give equal bytes."""
     ids = dataset.truth.image_id
-    for number, shard in enumerate(dataset.shards):
+    starts = (
+        [s.first for s in dataset.shards] if isinstance(dataset, Dataset) else range(0, len(dataset), IMAGES_PER_TAR)
+    )
+    for number, (first, end) in enumerate(pairwise([*starts, len(dataset)])):
         buffer = io.BytesIO()
         with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
-            for n in range(shard.first, shard.first + shard.count):
+            for n in range(first, end):
                 image, keypoints = dataset[n]
                 columns = {name: _to_json_numbers(keypoints[name]) for name in KEYPOINT_DTYPE.names or ()}
                 label = {"image_id": int(ids[n]), "keypoints": columns, "degradations": dataset.effects(n)}
@@ -206,7 +248,7 @@ def _to_json_numbers(column: NDArray[Any]) -> list[Any]:
     return [None if value != value else value for value in column.tolist()]
 
 
-EXPORT_FORMATS: dict[str, Callable[[Dataset, Path, Progress], Path]] = {
+EXPORT_FORMATS: dict[str, Callable[[Dataset | CocoDataset, Path, Progress, list[str]], Path]] = {
     "coco": _export_coco,
     "yolo": _export_yolo,
     "webdataset": _export_webdataset,

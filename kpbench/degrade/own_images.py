@@ -57,7 +57,7 @@ def open_own_images(source: str | Path, out: str | Path) -> ImageSource:
     1
     """
     if (Path(source) / "dataset.json").exists():
-        raise DataError(f"{source}: a dataset, expected images; `kpbench synth` and `kpbench suite` degrade their own")
+        raise DataError(f"{source}: a dataset, expected images; `suite` degrades a dataset")
     refuse_same_folder(source, Path(out))
     images = open_images(str(source), exclude=Path(out))
     require_drawable(Path(out), images.names, DEGRADED)

@@ -22,6 +22,7 @@ from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import UNDECODABLE, ImageSource, image_writer
 from kpbench.opencv import opencv_version, warn_of_opencv
+from kpbench.predictions.coco import CocoDataset
 from kpbench.types import Detections, Int, Predictions, UInt8
 from kpbench.workers import Progress, run_jobs
 
@@ -68,7 +69,7 @@ Sink = Callable[[Predictions], None]
 
 
 def predict(
-    source: Dataset | ImageSource,
+    source: Dataset | CocoDataset | ImageSource,
     detector: str | LoadedDetector,
     *,
     threshold: float | None = None,
@@ -81,7 +82,7 @@ def predict(
 
     Parameters
     ----------
-    source : Dataset or ImageSource
+    source : Dataset, CocoDataset or ImageSource
         See :func:`open_source`.
     detector : str or LoadedDetector
         A name as for :func:`kpbench.load_detector`, or a loaded detector.
@@ -200,7 +201,11 @@ def predict_images(
 
 
 def _finish(
-    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
+    detector: LoadedDetector,
+    found: list[ImageResult],
+    labels: list[str],
+    ids: Int,
+    source: Dataset | CocoDataset | ImageSource,
 ) -> PredictionRun:
     failures = tuple((label, r.problem) for label, r in zip(labels, found, strict=True) if r.problem)
     if found and len(failures) == len(found):
@@ -213,7 +218,7 @@ def _finish(
 
 
 def _pass_on(
-    sink: Sink | None, detector: LoadedDetector, source: Dataset | ImageSource
+    sink: Sink | None, detector: LoadedDetector, source: Dataset | CocoDataset | ImageSource
 ) -> Callable[[list[ImageResult], list[str], Int], None]:
     """Return a function that gives the predictions of some images to ``sink``, and give it those of no image."""
 
@@ -226,11 +231,15 @@ def _pass_on(
 
 
 def _collect(
-    detector: LoadedDetector, found: list[ImageResult], labels: list[str], ids: Int, source: Dataset | ImageSource
+    detector: LoadedDetector,
+    found: list[ImageResult],
+    labels: list[str],
+    ids: Int,
+    source: Dataset | CocoDataset | ImageSource,
 ) -> Predictions:
     about = {"name": detector.name, "version": detector.version, "opencv": opencv_version()}
     of_dataset: dict[str, Any] = {"size": [r.size for r in found], "ms": [r.ms for r in found]}
-    if isinstance(source, Dataset):
+    if not isinstance(source, ImageSource):
         of_dataset |= {"dataset": str(source.path), "fingerprint": source.fingerprint}
         of_dataset["truth_digest"] = source.truth.digest
     elif found:
@@ -275,7 +284,11 @@ def _load_once(name: str, threshold: float | None) -> LoadedDetector:
 
 
 def detect_images(
-    dataset: Dataset, detector: str | LoadedDetector, threshold: float | None, positions: range, progress: Progress
+    dataset: Dataset | CocoDataset,
+    detector: str | LoadedDetector,
+    threshold: float | None,
+    positions: range,
+    progress: Progress,
 ) -> dict[int, ImageResult]:
     """Run a detector over some images of a dataset.
 

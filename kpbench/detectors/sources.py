@@ -7,27 +7,30 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from kpbench.dataset.folder import MANIFEST, Dataset, open_dataset
+from kpbench.dataset.folder import MANIFEST, Dataset
+from kpbench.dataset.labelled import is_labelled, open_labelled
 from kpbench.errors import DataError
 from kpbench.files import IMAGE_SUFFIXES, image_files
 from kpbench.images import ImageSource, open_images, read_files, refuse_same_folder
 from kpbench.patches.design import shipped_patches
+from kpbench.predictions.coco import CocoDataset
 
 
-def open_source(*sources: str | Path, overlay: Path | None = None) -> Dataset | ImageSource:
-    """Open a dataset, images, folders of images, a video, or a camera.
+def open_source(*sources: str | Path, overlay: Path | None = None) -> Dataset | CocoDataset | ImageSource:
+    """Open labelled images, images without labels, folders of images, a video, or a camera.
 
     Parameters
     ----------
     sources : str or Path
-        Path, ``camera:0`` for the first camera, or a pattern such as ``photos/**/*.png``. Several sources are images
-        and folders of images; an image that is there twice is taken once.
+        Path, ``camera:0`` for the first camera, or a pattern such as ``photos/**/*.png``. The path may be labelled
+        images, as for :func:`kpbench.dataset.open_labelled`. Several sources are images and folders of images; an image
+        that is there twice is taken once.
     overlay : Path, optional
         Folder or file that detections will be drawn into. Images below this folder are left out of the source.
 
     Returns
     -------
-    Dataset or ImageSource
+    Dataset, CocoDataset or ImageSource
         For :func:`kpbench.predict`.
 
     Raises
@@ -49,8 +52,8 @@ def open_source(*sources: str | Path, overlay: Path | None = None) -> Dataset | 
     if len(given) > 1:
         return _open_several(given, overlay)
     [source] = given
-    if (Path(source) / MANIFEST).exists() or any(Path(source).glob("shard-*.h5")):
-        return open_dataset(source)
+    if is_labelled(source):
+        return open_labelled(source)
     return open_images(source, exclude=overlay)
 
 
@@ -86,7 +89,7 @@ def _open_several(sources: Sequence[str], exclude: Path | None) -> ImageSource:
     return ImageSource(images, len(names), problems=problems, names=names, folder=folder)
 
 
-def has_other_designs(source: Dataset | ImageSource) -> bool:
+def has_other_designs(source: Dataset | CocoDataset | ImageSource) -> bool:
     """Return whether a source is a dataset whose designs differ from the shipped designs.
 
     Examples
@@ -95,7 +98,11 @@ def has_other_designs(source: Dataset | ImageSource) -> bool:
     >>> kpbench.detectors.has_other_designs(kpbench.open_dataset("kpbench-data"))
     False
     """
-    if isinstance(source, ImageSource):
+    if not isinstance(source, Dataset):
         return False
     shown = source.config.get("patches")
-    return shown is not None and shown != [patch.to_dict() for patch in shipped_patches()]
+    return (
+        shown is not None
+        and any("semicircles" in p for p in shown)
+        and shown != [patch.to_dict() for patch in shipped_patches()]
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,7 @@ from kpbench.predictions.decode import (
     split_lists,
 )
 from kpbench.predictions.tables import build_predictions
+from kpbench.provenance import image_source
 from kpbench.types import KEYPOINT_DTYPE, Predictions, Truth, UInt8, offsets_of
 
 IMAGES_LOOKED_AT = 20
@@ -52,9 +53,13 @@ class CocoDataset:
     path : Path
         The annotations file.
     truth : Truth
+        ``H_patch2image`` is zero and ``contrast`` nan, as annotations do not tell them.
     files : tuple of str
         File names of the images, relative to the folder of the annotations file or to its ``images`` folder. The
         files may be missing. A file is read only if it lies below the folder, after symbolic links are followed.
+    config : dict
+        ``patches``: the IDs and names of the categories. ``source``: what the images are, if ``info`` has a ``source``
+        that is "simulated", "simulated photographs" or "photographs".
 
     Examples
     --------
@@ -68,16 +73,27 @@ class CocoDataset:
     path: Path
     truth: Truth
     files: tuple[str, ...]
+    config: dict[str, Any] = field(default_factory=dict)
 
     @property
     def fingerprint(self) -> str:
         """Fingerprint in the annotations file; the SHA-256 of the file if the file holds no fingerprint."""
         return self.truth.fingerprint
 
-    @property
-    def config(self) -> dict[str, Any]:
-        """Empty: annotations do not tell how the images were made."""
-        return {}
+    def __len__(self) -> int:
+        return len(self.truth)
+
+    def keypoints(self, index: int) -> NDArray[Any]:
+        """Return the true keypoints of an image, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
+        first, last = self.truth.offsets[index : index + 2]
+        return self.truth.keypoints[first:last]
+
+    def effects(self, index: int) -> list[dict[str, Any]]:
+        """Return an empty list: annotations do not tell what degraded an image."""
+        return []
+
+    def __getitem__(self, index: int) -> tuple[UInt8, NDArray[Any]]:
+        return self.image(index), self.keypoints(index)
 
     def image(self, index: int) -> UInt8:
         """Return the image at an index into the truth, as uint8 of shape (H, W, 3), RGB.
@@ -131,7 +147,8 @@ def open_coco(path: str | Path) -> CocoDataset:
         data = read_bytes(path)
         require_utf8(data)
         with pause_gc():
-            info, images, annotations = _decode_annotations(data)
+            about, images, annotations = _decode_annotations(data)
+        info = about.get("info")
         fingerprint = info.get("fingerprint") if isinstance(info, dict) else None
         if not isinstance(fingerprint, str) or not fingerprint:
             fingerprint = hashlib.sha256(data).hexdigest()
@@ -140,7 +157,7 @@ def open_coco(path: str | Path) -> CocoDataset:
         files = truth.file or ("",) * len(truth)
         _warn_of_orientation(path, images)
         _warn_of_keypoints_outside(path, images, truth)
-        return CocoDataset(path, truth, files)
+        return CocoDataset(path, truth, files, _describe(about))
     except OSError as error:
         raise DataError(f"{path}: cannot be read, {system_reason(error) or error}") from None
     except (DataError, PredictionsError) as error:
@@ -191,7 +208,7 @@ def _warn_of_keypoints_outside(path: Path, images: Columns, truth: Truth) -> Non
 
 
 def _decode_annotations(data: bytes) -> tuple[Any, Columns, Columns]:
-    """Return ``info``, the images and the annotations."""
+    """Return everything but the two lists, the images and the annotations."""
 
     def place_image(n: int) -> str:
         return f"images[{n}]"
@@ -202,7 +219,7 @@ def _decode_annotations(data: bytes) -> tuple[Any, Columns, Columns]:
     try:
         frame, (images, annotations) = split_lists(data, "images", "annotations")
         return (
-            frame.get("info"),
+            frame,
             make_columns(decode_records(images, CocoImage, EXPECTED_IN_COCO, place_image), IMAGE_COLUMNS),
             make_columns(
                 decode_records(annotations, CocoAnnotation, EXPECTED_IN_COCO, place_annotation), ANNOTATION_COLUMNS
@@ -216,13 +233,26 @@ def _decode_annotations(data: bytes) -> tuple[Any, Columns, Columns]:
         if not isinstance(content.get(name), list):
             raise DataError(f"has no list {name!r}, expected COCO annotations") from None
     return (
-        content.get("info"),
+        content,
         make_columns([convert_records(content["images"], CocoImage, EXPECTED_IN_COCO, place_image)], IMAGE_COLUMNS),
         make_columns(
             [convert_records(content["annotations"], CocoAnnotation, EXPECTED_IN_COCO, place_annotation)],
             ANNOTATION_COLUMNS,
         ),
     )
+
+
+def _describe(about: dict[str, Any]) -> dict[str, Any]:
+    """Return :attr:`CocoDataset.config` from the annotations. Categories without a whole ID and a name are left out."""
+    categories = about.get("categories")
+    patches = [
+        {"id": category["id"] - 1, "name": category["name"]}
+        for category in (categories if isinstance(categories, list) else [])
+        if isinstance(category, dict) and type(category.get("id")) is int and isinstance(category.get("name"), str)
+    ]
+    info = about.get("info")
+    source = image_source({"source": info.get("source")} if isinstance(info, dict) else {})
+    return ({"patches": patches} if patches else {}) | ({"source": source} if source else {})
 
 
 def _make_truth(images: Columns, annotations: Columns, fingerprint: str) -> Truth:
@@ -259,6 +289,7 @@ def _make_keypoints(annotations: Columns) -> tuple[NDArray[Any], NDArray[np.bool
     table = np.zeros(len(points), KEYPOINT_DTYPE)
     table["x"], table["y"] = points[:, 0], points[:, 1]
     table["patch_id"] = annotations["category_id"] - 1
+    table["contrast"] = np.nan
     radius, major, minor = (annotations[name] for name in ("radius", "radius_major", "radius_minor"))
     with np.errstate(over="ignore"):  # some columns have 32 bits; a number that they cannot hold is refused as inf
         for name in ("axis_angle", "visible"):

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from kpbench.errors import DataError
 from kpbench.files import encode_utf8
+from kpbench.provenance import UNKNOWN_SOURCE, describe_images, image_source
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
 from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.score_charts import (
@@ -87,8 +88,8 @@ class Report:
 
     @property
     def images(self) -> str:
-        """How the images were made: "simulated", or "" if the config does not tell."""
-        return "simulated" if self.config.get("kind") in ("suite", "synth") else ""
+        """What the images are, see :func:`kpbench.provenance.image_source`; "" if the config does not tell."""
+        return image_source(self.config)
 
     @property
     def patch_names(self) -> dict[int, str]:
@@ -155,7 +156,7 @@ def _comparison_section(report: Report) -> Section:
 
 def _paper_section(report: Report) -> Section:
     known = [PAPER[name] for name in _conditions(report) if name in PAPER]
-    tables = [paper_table(report.runs, table, report.images or "the user's") for table in known]
+    tables = [paper_table(report.runs, table, report.images or UNKNOWN_SOURCE) for table in known]
     deteriorate, limits = str(report.config.get("deteriorate")), report.config.get("limits", {})
     radius_px = tuple(limits.get("radius_px", SYNTHETIC_RADIUS_PX))
     if deteriorate in SYNTHETIC and radius_px == SYNTHETIC_RADIUS_PX:
@@ -277,9 +278,9 @@ def _render_text(
 def _describe_images(report: Report) -> str:
     first = report.runs[0]
     n = first.overall.counts
-    made = f" {report.images}" if report.images else ""
     fingerprint = f", fingerprint {first.fingerprint[:16]}" if first.fingerprint else ""
-    text = f"{n['images']}{made} images in {n['scenes']} scenes with {n['truths']} keypoints{fingerprint}."
+    images = describe_images(n["images"] or 0, report.images)
+    text = f"{images} in {n['scenes']} scenes with {n['truths']} keypoints{fingerprint}."
     if first.outcomes.truth_points.least_reach_px is not None:
         error = first.truth_error
         text += f" The truth has a standard deviation of {error['sigma_median_px']:.4f} px (median); it limits the "

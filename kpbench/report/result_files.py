@@ -8,12 +8,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
 from kpbench import __version__
 from kpbench.files import encode_utf8, escape_surrogates, sha256_of
+from kpbench.provenance import image_source
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import Comparison
@@ -25,10 +26,29 @@ COMPARISON_SCHEMA = "kpbench.comparison/1"
 """Name and version of the format of comparison files."""
 
 
-def collect_provenance(
-    dataset: Path, fingerprint: str, predictions: Sequence[Path], command: Sequence[str]
-) -> dict[str, Any]:
+class ScoredImages(Protocol):
+    """The attributes of a dataset that go into the provenance of its scores."""
+
+    @property
+    def path(self) -> Path:
+        """Folder of the dataset, or its annotations file."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Digest of the dataset."""
+        ...
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """How the images were made; may be empty."""
+        ...
+
+
+def collect_provenance(dataset: ScoredImages, predictions: Sequence[Path], command: Sequence[str]) -> dict[str, Any]:
     """Collect the provenance of scores: predictions files with their SHA-256, dataset, command and versions.
+
+    ``source`` of the dataset tells what its images are, see :func:`kpbench.provenance.image_source`; None if unknown.
 
     Time and machine are left out, so that the same input gives the same bytes.
     """
@@ -36,7 +56,11 @@ def collect_provenance(
         "kpbench": __version__,
         "command": " ".join(command),
         "predictions": [{"file": str(path), "sha256": sha256_of(path)} for path in predictions],
-        "dataset": {"path": str(dataset), "fingerprint": fingerprint},
+        "dataset": {
+            "path": str(dataset.path),
+            "fingerprint": dataset.fingerprint,
+            "source": image_source(dataset.config) or None,
+        },
         "versions": {name: version(name) for name in ("numpy", "scipy")},
     }
 
@@ -69,6 +93,7 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
         "schema": TABLE_SCHEMA,
         "detector": scores.name,
         "dataset": scores.fingerprint,
+        "source": provenance.get("dataset", {}).get("source") or "",
         "kpbench": provenance["kpbench"],
     }
     rows = [{name: escape_csv(value) for name, value in (about | row).items()} for row in scores.rows()]

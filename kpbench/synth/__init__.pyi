@@ -1,3 +1,4 @@
+from .degraded import DegradeConfig as DegradeConfig
 from .suite import SuiteConfig as SuiteConfig
 from .suite_file import Condition as Condition
 from .suite_file import Suite as Suite

@@ -218,7 +218,7 @@ class SuiteConfig:
             "shard_size": self.shard_size,
             "backgrounds": describe_backgrounds(self.photos),
             "scene": {key: list(span) for key, span in self.suite.scene},
-            "conditions": [_describe_condition(c) for c in conditions],
+            "conditions": [describe_condition(c) for c in conditions],
             **({} if preset is None else {"preset": preset.to_dict()}),
             **({} if self.suite.film is None else {"film": self.suite.film.to_dict()}),
             **targets,
@@ -338,7 +338,7 @@ def _pose(camera: Camera, board: BoardLike, drawn: dict[str, float], inside_mm: 
     return pose_board(camera, board, drawn["area_percent"], **angles, shift=shift, inside_mm=inside_mm)
 
 
-def _describe_condition(condition: Condition) -> dict[str, Any]:
+def describe_condition(condition: Condition) -> dict[str, Any]:
     """Return a condition for the config; the effects are a list, because their order matters."""
     pose = {key: list(values) for key, values in condition.pose}
     effects = [[name, list(levels)] for name, levels in condition.effects]

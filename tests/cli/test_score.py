@@ -80,7 +80,11 @@ def test_files_hold_what_the_screen_shows(here):
     assert content["metrics"]["detection_score"] == 1
     assert content["by"][0]["condition"] == "blur"
     assert content["provenance"]["predictions"] == [{"file": "p.json", "sha256": sha256_of(here / "p.json")}]
-    assert content["provenance"]["dataset"] == {"path": "kpbench-data", "fingerprint": data.fingerprint}
+    assert content["provenance"]["dataset"] == {
+        "path": "kpbench-data",
+        "fingerprint": data.fingerprint,
+        "source": None,
+    }
     with (here / "s.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 1 + len(content["by"])

@@ -38,14 +38,16 @@ def test_a_yolo_pose_parser_finds_our_keypoints(dataset, tmp_path):
     for n, image_id in enumerate(dataset.truth.image_id):
         image, keypoints = dataset[n]
         height, width = image.shape
-        text = (tmp_path / "yolo" / "labels" / f"{image_id:08d}.txt").read_text()
+        [label] = (tmp_path / "yolo" / "labels").glob(f"*/{image_id:08d}.txt")
+        assert (tmp_path / "yolo" / "images" / label.parent.name / f"{image_id:08d}.png").is_file()
+        text = label.read_text()
         rows = np.array([line.split() for line in text.splitlines()], float).reshape(-1, 8)
         assert rows[:, 0].tolist() == keypoints["patch_id"].tolist()
         assert np.allclose(rows[:, 5] * width - 0.5, keypoints["x"], atol=1e-5)
         assert np.allclose(rows[:, 6] * height - 0.5, keypoints["y"], atol=1e-5)
         assert ((rows[:, 1:7] >= 0) & (rows[:, 1:7] <= 1)).all()
     described = (tmp_path / "yolo" / "data.yaml").read_text()
-    assert "kpt_shape: [1, 3]" in described
+    assert "train: images/train\nval: images/val\nkpt_shape: [1, 3]" in described
     assert '  0: "checker"' in described
 
 

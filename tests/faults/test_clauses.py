@@ -3,6 +3,7 @@
 import ast
 import builtins
 import errno
+import hashlib
 import os
 import resource
 import signal
@@ -78,7 +79,7 @@ WRITERS = {
     "images.py": "a film's hidden part, which the gate then moves",
     "dataset/generation.py": "a hard link, which replaces nothing",
     "dataset/export.py": "removes hidden parts of an export",
-    "benchmark.py": "removes an empty folder",
+    "benchmark/detection.py": "removes an empty folder",
     "detectors/program.py": "the temporary folder",
 }
 """Modules that write or remove files by themselves, and what."""
@@ -343,7 +344,8 @@ def test_the_log_of_a_training_is_no_file_of_the_users(tmp_path, kind):
 def test_an_export_keeps_hidden_files_of_the_users(here):
     dataset = write_dataset(here / "set", IMAGES)
     (here / "out").mkdir()
-    mark = f"kpbench.export/1 coco {dataset.fingerprint}\n"
+    digest = hashlib.sha256(f"{dataset.fingerprint} ".encode()).hexdigest()
+    mark = f"kpbench.export/1 coco {digest}\n"
     (here / "out" / ".kpbench-unfinished").write_text(mark)
     (here / "out" / ".notes.part").write_text("mine")
     (here / "out" / ".annotations.json.0123abcd.part").write_text("half")

@@ -1,0 +1,1 @@
+"""Run detectors over benchmark suites and datasets, and report their scores."""
