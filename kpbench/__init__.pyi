@@ -51,6 +51,7 @@ from .synth.synthetic import SynthConfig as SynthConfig
 from .tracking.scores import score_poses as score_poses
 from .tracking.tracker import TrackedPose as TrackedPose
 from .tracking.tracker import Tracker as Tracker
+from .training.image_stream import stream as stream
 from .types import KEYPOINT_DTYPE as KEYPOINT_DTYPE
 from .types import LABELLED_KEYPOINT_DTYPE as LABELLED_KEYPOINT_DTYPE
 from .types import Detections as Detections

@@ -207,14 +207,17 @@ class _Child:
         return None
 
     def stop(self) -> None:
-        """End the process, if this process started it."""
-        if self.started_by != os.getpid():
-            return
-        self.process.kill()
+        """End the process, if this process started it. Close this process's ends of the pipes."""
+        is_own = self.started_by == os.getpid()
+        if is_own:
+            self.process.kill()
         for pipe in (self.questions, self.replies):
             with suppress(OSError):
                 pipe.close()
-        self.process.wait()
+        if is_own:
+            self.process.wait()
+        else:
+            self.process.returncode = 0  # only the process that started it can wait for it
 
 
 _lock = threading.Lock()

@@ -20,7 +20,7 @@ SUITE_FILM = 22
 noise of its sensor from SUITE_SENSOR of n·N + k."""
 
 
-def stream(seed: int, index: int, stage: int) -> np.random.Generator:
+def stage_rng(seed: int, index: int, stage: int) -> np.random.Generator:
     """Return the random numbers of one stage of one image.
 
     The random numbers are independent of the random numbers of every other stage, image and seed.
@@ -36,8 +36,8 @@ def stream(seed: int, index: int, stage: int) -> np.random.Generator:
 
     Examples
     --------
-    >>> from kpbench.seeds import SYNTH_SCENE, stream
-    >>> stream(0, 7, SYNTH_SCENE).random() == stream(0, 7, SYNTH_SCENE).random()
+    >>> from kpbench.seeds import SYNTH_SCENE, stage_rng
+    >>> stage_rng(0, 7, SYNTH_SCENE).random() == stage_rng(0, 7, SYNTH_SCENE).random()
     True
     """
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(index, stage))))

@@ -255,6 +255,23 @@ def use_threads(count: int) -> None:
 
 
 @cache
+def survive_forks() -> None:
+    """Let OpenCV work in processes that are forked from this one from now on.
+
+    A forked process has none of the threads of OpenCV's pool, but waits for them. So the pool is emptied before a fork.
+    """
+    if not hasattr(os, "register_at_fork"):
+        return
+    before = list[int]()
+
+    def empty_pool() -> None:
+        before.append(cv2.getNumThreads())
+        cv2.setNumThreads(1)
+
+    os.register_at_fork(before=empty_pool, after_in_parent=lambda: cv2.setNumThreads(before.pop()))
+
+
+@cache
 def keep_freed_memory() -> None:
     """Make the C library keep up to 128 MiB of freed memory for this process.
 

@@ -17,7 +17,7 @@ import kpbench
 from kpbench import shipped_patches
 from kpbench.geometry import project_discs
 from kpbench.render import Limits, random_placements
-from kpbench.seeds import SYNTH_SCENE, stream
+from kpbench.seeds import SYNTH_SCENE, stage_rng
 
 
 def tilts_deg(H: np.ndarray, width_px: int, height_px: int) -> np.ndarray:
@@ -62,7 +62,7 @@ def main() -> None:
     print(f"nearest two discs (as circles of their long axes): {min(gaps):.3f} px apart")
     inks, patches = [], shipped_patches()
     for n in range(len(dataset)):
-        placements = random_placements(stream(dataset.config["seed"], n, SYNTH_SCENE), width, height, patches, Limits())
+        placements = random_placements(stage_rng(dataset.config["seed"], n, SYNTH_SCENE), width, height, patches, Limits())
         rows = keypoints["H_patch2image"][truth.offsets[n] : truth.offsets[n + 1]]
         assert np.array_equal(
             rows.reshape(-1, 9), np.array([p.H_patch2image.ravel() for p in placements]).reshape(-1, 9)

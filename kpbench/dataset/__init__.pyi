@@ -14,6 +14,7 @@ from .generation import generate as generate
 from .generation import generate_part as generate_part
 from .generation import merge as merge
 from .labelled import open_labelled as open_labelled
+from .padding import pad_sample as pad_sample
 from .shard import Sample as Sample
 from .splits import split_scenes as split_scenes
 

@@ -37,6 +37,11 @@ class DatasetConfig(Protocol):
         """Expected size of one image on disk, bytes."""
         ...
 
+    @property
+    def most_keypoints(self) -> int:
+        """Largest number of true keypoints that an image can have."""
+        ...
+
     def to_dict(self) -> dict[str, Any]:
         """Return the configuration as it is written into the dataset, without any path."""
         ...

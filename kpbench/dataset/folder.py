@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kpbench.dataset.padding import pad_sample
 from kpbench.dataset.shard import DATASET_SCHEMA, Shard, canonical_json, open_shard, shard_errors
 from kpbench.errors import DataError, system_reason
 from kpbench.files import DoubleKeyError, encode_utf8, folder_at, load_json, read_bytes, sha256_of
@@ -102,8 +103,9 @@ def recorded_digests(folder: Path) -> dict[str, str]:
 class Dataset:
     """A finished dataset, opened by :func:`open_dataset` and read lazily.
 
-    ``dataset[n]`` is the pair of image n and its true keypoints. A torch DataLoader can load the dataset.
-    A dataset can be pickled and used after a fork.
+    ``dataset[n]`` is the pair of image n and its true keypoints. A torch DataLoader takes the dataset as it is, and
+    gives batches of the arrays that :func:`kpbench.dataset.pad_sample` lists. A dataset can be pickled and used after a
+    fork.
 
     Attributes
     ----------
@@ -182,6 +184,12 @@ class Dataset:
             low, high = file["offsets"][row : row + 2]
             return np.asarray(file["keypoints"][low:high])
 
+    def image_id(self, index: int) -> int:
+        """Return the ID of image number ``index``."""
+        file, row, path = self._locate(index)
+        with shard_errors(path):
+            return int(file["image_id"][row])
+
     def effects(self, index: int) -> list[dict[str, Any]]:
         """Return the records of the effects that degraded image number ``index``, in the order of application."""
         file, row, path = self._locate(index)
@@ -190,6 +198,15 @@ class Dataset:
 
     def __getitem__(self, index: int) -> tuple[UInt8, NDArray[Any]]:
         return self.image(index), self.keypoints(index)
+
+    def __getitems__(self, indices: Sequence[int]) -> list[dict[str, NDArray[Any]]]:
+        """Return images as the samples of :func:`kpbench.dataset.pad_sample`. A torch DataLoader calls this per batch.
+
+        The columns of keypoints are as long as the longest of these images.
+        """
+        read = [(*self[n], self.image_id(n)) for n in indices]
+        rows = max(len(keypoints) for _, keypoints, _ in read)
+        return [pad_sample(*sample, rows) for sample in read]
 
     def _read_columns(self, names: Sequence[str]) -> Iterator[list[NDArray[Any]]]:
         """Yield whole columns, shard by shard."""

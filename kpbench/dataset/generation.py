@@ -123,7 +123,7 @@ def generate(
     """
     refuse_resume_with_overwrite(resume, overwrite)
     with _open_executor(executor, scheduler) as executor:
-        folder, written = make_folder(folder_at(out)), _describe(config)
+        folder, written = make_folder(folder_at(out)), describe_config(config)
         # before a plan of a billion images is made and compared with the folder
         require_space(folder, config.n * config.image_bytes, f"{config.n} images", of_empty_disk=True)
         plan = plan_shards(config.n, config.shard_size)
@@ -188,7 +188,7 @@ def generate_part(
         raise DataError(f"`shards` is {asked}, expected {expected}, the number of shards")
     part = plan[shards.start : shards.stop]
     with _open_executor(executor, scheduler) as executor:
-        folder, written = make_folder(folder_at(out)), _describe(config)
+        folder, written = make_folder(folder_at(out)), describe_config(config)
         run = _Run(config, folder, written, part, workers, executor, progress)
         with lock_folder(folder, shared=True):
             kept = prepare_folder(folder, written, part, resume, overwrite)
@@ -331,7 +331,7 @@ def _finish_dataset(
         return open_dataset(folder), broken_files
 
 
-def _describe(config: DatasetConfig) -> dict[str, Any]:
+def describe_config(config: DatasetConfig) -> dict[str, Any]:
     """Return the config that is written into every shard: what it says, and the software that its pixels depend on.
 
     Shards with different configs are never mixed, in a resumed run or a merge. kpbench's own pixels do not depend on

@@ -21,7 +21,7 @@ from kpbench.images import (
     refuse_same_folder,
     require_drawable,
 )
-from kpbench.seeds import stream
+from kpbench.seeds import stage_rng
 from kpbench.types import UInt8
 from kpbench.writing import write_file
 
@@ -110,7 +110,7 @@ def degrade_files(
             broken.append((name, source.problems.get(name, UNDECODABLE)))
             continue
         image = _as_grey_if_colourless(image)
-        rng = stream(seed, n, 0)
+        rng = stage_rng(seed, n, 0)
         effects = [draw_effect(rng, effect, level, (image.shape[1], image.shape[0])) for effect, level in steps]
         image = apply_effects(image, rng, effects)
         target = Path(out, drawing_name(name))

@@ -25,7 +25,7 @@ from kpbench.predictions.coco import CocoDataset
 from kpbench.provenance import image_source
 from kpbench.render.placement import Placement
 from kpbench.render.scene import measure_contrast, rasterise_patches
-from kpbench.seeds import SUITE_EFFECT, SUITE_FIELD, stream
+from kpbench.seeds import SUITE_EFFECT, SUITE_FIELD, stage_rng
 from kpbench.synth.finish import discs_of, unoccluded_fraction
 from kpbench.synth.suite import describe_condition
 from kpbench.synth.suite_file import Condition, Suite
@@ -189,6 +189,11 @@ class DegradeConfig:
         rung, base = divmod(index - len(self.labelled), len(self.bases))
         return self.bases[base], *self.rungs[rung]
 
+    @property
+    def most_keypoints(self) -> int:
+        """Largest number of keypoints of a labelled image."""
+        return int(np.diff(self.labelled.truth.offsets).max())
+
     def scene_id(self, index: int) -> int:
         """Return the scene of an image, which is that of the labelled image."""
         return int(self.labelled.truth.scene_id[self._locate(index)[0]])
@@ -208,9 +213,9 @@ class DegradeConfig:
         if condition is None:
             name, rung = str(truth.condition[position]), float(truth.rung[position])
             return Sample(index, image, keypoints, effects, condition=name, rung=rung, scene_id=scene), ()
-        rng, discs = stream(self.seed, scene, SUITE_EFFECT), discs_of(keypoints)
+        rng, discs = stage_rng(self.seed, scene, SUITE_EFFECT), discs_of(keypoints)
         added = [draw_effect(rng, name, levels[step], self.size_px, discs) for name, levels in condition.effects]
-        image = apply_effects(image, stream(self.seed, scene, SUITE_FIELD), added)
+        image = apply_effects(image, stage_rng(self.seed, scene, SUITE_FIELD), added)
         keypoints = self._update(image, keypoints, added)
         rung = condition.rungs[step]
         return Sample(

@@ -31,7 +31,7 @@ from kpbench.seeds import (
     SUITE_FILM,
     SUITE_SCENE,
     SUITE_SENSOR,
-    stream,
+    stage_rng,
 )
 from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
 from kpbench.synth.film import FILM_KEYS, draw_bar, draw_path, film_record
@@ -183,6 +183,11 @@ class SuiteConfig:
         """Expected size of one image on disk."""
         return int(0.6 * self.camera.width_px * self.camera.height_px)
 
+    @property
+    def most_keypoints(self) -> int:
+        """Largest number of keypoints of a board."""
+        return max(len(board.keypoints) for board in self.boards)
+
     @cached_property
     def photos(self) -> PhotoFolder | None:
         """The opened folder of photographs; None for procedural backgrounds."""
@@ -240,11 +245,11 @@ class SuiteConfig:
         rung, which_board = divmod(index // self._frames // self.scenes, len(self.boards))
         condition, step = self.rungs[rung]
         board = (self._single_boards if condition.board == "single" else self.boards)[which_board]
-        rng = stream(self.seed, scene_id, SUITE_SCENE)
+        rng = stage_rng(self.seed, scene_id, SUITE_SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
         preset = self.presets[rung]
-        taken = None if preset is None else preset.draw(stream(self.seed, scene_id, SUITE_CAMERA))
+        taken = None if preset is None else preset.draw(stage_rng(self.seed, scene_id, SUITE_CAMERA))
         camera = replace(self.camera, distortion=(taken["k1"], 0.0, 0.0, 0.0)) if taken and taken["k1"] else self.camera
         inside_mm = disc_outline(board) if condition.board == "single" else None
         film, frame, record = self.suite.film, index % self._frames, None
@@ -299,7 +304,7 @@ class SuiteConfig:
             clean = photograph_board(background.image, view.camera, view.exposed, view.appearance, rng, taken)
         else:
             clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)
-        scene = degrade_scene(clean, stream(self.seed, view.scene_id, SUITE_FIELD), view.effects)
+        scene = degrade_scene(clean, stage_rng(self.seed, view.scene_id, SUITE_FIELD), view.effects)
         sample = Sample(
             index,
             scene.image,
@@ -320,7 +325,7 @@ class SuiteConfig:
         key = (scene_id, channels)
         if key in self._background_cache:
             return self._background_cache[key]
-        rng = stream(self.seed, scene_id, SUITE_BACKGROUND)
+        rng = stage_rng(self.seed, scene_id, SUITE_BACKGROUND)
         width, height = self.camera.width_px, self.camera.height_px
         if self.photos is None:
             background = Background(procedural_background(rng, width, height, channels))

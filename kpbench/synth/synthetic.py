@@ -29,7 +29,7 @@ from kpbench.seeds import (
     SYNTH_DETERIORATION,
     SYNTH_LOOKALIKES,
     SYNTH_SCENE,
-    stream,
+    stage_rng,
 )
 from kpbench.synth.camera_view import photograph_scene
 from kpbench.synth.finish import augment_scene, degrade_scene, discs_of
@@ -175,6 +175,11 @@ class SynthConfig:
         width, height = self.size_px
         return int(width * height * self.channels * (0.85 if self.deteriorate == "paper" else 0.7))
 
+    @property
+    def most_keypoints(self) -> int:
+        """Largest number of patches per image."""
+        return self.limits.count[1]
+
     def scene_id(self, index: int) -> int:
         """Return the base scene of an image; every image has its own base scene."""
         return index
@@ -194,24 +199,24 @@ class SynthConfig:
             Background files that were tried and could not be decoded.
         """
         width, height = self.size_px
-        background = self._make_background(stream(self.seed, index, SYNTH_BACKGROUND))
+        background = self._make_background(stage_rng(self.seed, index, SYNTH_BACKGROUND))
         if self.distractors:
-            rng = stream(self.seed, index, SYNTH_LOOKALIKES)
+            rng = stage_rng(self.seed, index, SYNTH_LOOKALIKES)
             draw_lookalikes(background.image, rng, int(rng.integers(self.distractors + 1)), self.patches)
-        placements = random_placements(stream(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits)
+        placements = random_placements(stage_rng(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits)
         taken = list[Effect]()
         if self.camera is None:
             scene = render_scene(background.image, placements)
         else:
-            rng = stream(self.seed, index, SYNTH_CAMERA)
+            rng = stage_rng(self.seed, index, SYNTH_CAMERA)
             taken = [self.camera.draw(rng)]
             scene = photograph_scene(background.image, placements, rng, taken[0], self.camera.calibration)
-        rng = stream(self.seed, index, SYNTH_DETERIORATION)
+        rng = stage_rng(self.seed, index, SYNTH_DETERIORATION)
         effects = self._draw_effects(rng, scene.keypoints)
         scene = degrade_scene(scene, rng, effects)
         effects = [*taken, *effects]
         if self.augmentation is not None:
-            seed = int(stream(self.seed, index, SYNTH_AUGMENTATION).integers(2**31))
+            seed = int(stage_rng(self.seed, index, SYNTH_AUGMENTATION).integers(2**31))
             scene = augment_scene(scene, placements, effects, self.augmentation, seed)
             effects = [*effects, {"effect": "augmentation", "seed": seed}]
         return Sample(index, scene.image, scene.keypoints, effects, background.file), background.broken_files

@@ -6,6 +6,7 @@ from .checkpoint import TrainingState as TrainingState
 from .checkpoint import start_state as start_state
 from .export import Exported as Exported
 from .export import export_onnx as export_onnx
+from .image_stream import ImageStream as ImageStream
 from .loop import TrainOptions as TrainOptions
 from .loop import train as train
 from .network import SuperPoint as SuperPoint

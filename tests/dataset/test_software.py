@@ -39,10 +39,10 @@ def test_a_run_is_not_resumed_with_another_version_of_opencv(tmp_path, make_with
 
 
 def test_a_users_pipeline_ties_a_dataset_to_the_processor(monkeypatch):
-    written = generation._describe(CONFIG)
+    written = generation.describe_config(CONFIG)
     assert written["pixels"].keys() == {"version", "machine", "opencv"}
     monkeypatch.setattr(SynthConfig, "to_dict", lambda self: {"augmentation": {"transform": {}}})
-    assert generation._describe(CONFIG)["pixels"].keys() >= {"albumentations", "processor"}
+    assert generation.describe_config(CONFIG)["pixels"].keys() >= {"albumentations", "processor"}
 
 
 def perfect_predictions(dataset):
