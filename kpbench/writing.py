@@ -40,7 +40,7 @@ _TEXT_MARKS = [
         rb"(?:%YAML:1\.0\n---\n)?# MARK\n(?:image_width|cam0):",  # YAML of a calibration
         rb"(?:%YAML:1\.0\n---\n)?##? MARK\n(?:object_points|target_type|# point)",  # a board for another program
         rb"999\nMARK\n",  # DXF
-        rb"MARK (?:coco|yolo|webdataset) [0-9a-f]{64}\n",  # state of an export
+        rb"MARK (?:coco|yolo|webdataset|parquet) [0-9a-f]{64}\n",  # state of an export
     )
 ]
 """The start of each form of text that kpbench writes. In a text of any other form, a mark is a quotation."""

@@ -89,7 +89,7 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
 @click.command()
 @DATASET
 @click.option(
-    "--format", "file_format", type=click.Choice(["coco", "yolo", "webdataset"]), required=True, help="Format to write."
+    "--format", "file_format", type=click.Choice(["coco", "yolo", "webdataset", "parquet"]), required=True, help="Format to write."
 )
 @click.option("--out", type=click.Path(path_type=Path), help="New folder to write into. Default: DATASET-FORMAT.")
 @click.option(
@@ -97,10 +97,10 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     type=Finite(0, 1, max_open=True),
     default=0.2,
     show_default=True,
-    help="yolo: share of the scenes that are for validation.",
+    help="yolo, parquet: share of the scenes that are for validation.",
 )
 def export(dataset: Path, file_format: str, out: Path | None, val_share: float) -> None:
-    """Write a dataset as COCO keypoints, YOLO-pose or WebDataset.
+    """Write a dataset as COCO keypoints, YOLO-pose, WebDataset, or Parquet for Hugging Face datasets.
 
     DATASET may also be COCO annotations (.json), or a folder with annotations.json.
 

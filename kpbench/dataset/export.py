@@ -1,4 +1,4 @@
-"""A dataset in the formats of other tools: COCO keypoints, YOLO-pose, WebDataset.
+"""A dataset in the formats of other tools: COCO keypoints, YOLO-pose, WebDataset, Parquet.
 
 In kpbench and in the keypoints of COCO, the origin is the centre of the top-left pixel. In the boxes of COCO and in all
 coordinates of YOLO, the origin is the top-left corner of this pixel, half a pixel further left and up.
@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.dataset.card import patch_names, write_card
+from kpbench.dataset.croissant import write_croissant
 from kpbench.dataset.folder import Dataset
+from kpbench.dataset.parquet import export_parquet
 from kpbench.dataset.splits import SPLITS, VAL_SHARE, split_scenes
 from kpbench.dataset.usage import EXPORT_USAGE
 from kpbench.errors import DataError
@@ -58,18 +60,19 @@ def export_dataset(
     ----------
     dataset : Dataset or CocoDataset
         See :func:`kpbench.dataset.open_labelled`.
-    file_format : {"coco", "yolo", "webdataset"}
+    file_format : {"coco", "yolo", "webdataset", "parquet"}
     out : str or Path
         Folder; made if missing.
     progress : callable
         Called with the number of images written since its last call.
     val_share : float
-        Share of the scenes that are for validation, see :func:`kpbench.dataset.split_scenes`. Only "yolo" splits.
+        Share of the scenes that are for validation, see :func:`kpbench.dataset.split_scenes`. Only "yolo" and
+        "parquet" split.
 
     Returns
     -------
     Path
-        The main file: ``annotations.json``, ``data.yaml``, or the first tar.
+        The main file: ``annotations.json``, ``data.yaml``, the first tar, or ``croissant.json``.
 
     Raises
     ------
@@ -86,7 +89,7 @@ def export_dataset(
     if file_format not in EXPORT_FORMATS:
         raise DataError(f"`file_format` is {file_format!r}, expected one of: {', '.join(EXPORT_FORMATS)}")
     folder = Path(out)
-    share = f"{val_share:g}" if file_format == "yolo" else ""
+    share = f"{val_share:g}" if file_format in SPLIT_FORMATS else ""
     digest = hashlib.sha256(f"{dataset.fingerprint} {share}".encode()).hexdigest()
     mark, content = folder / UNFINISHED, f"{EXPORT_MARK} {file_format} {digest}\n".encode()
     if folder.is_dir() and any(path.name != LOCK_FILE for path in folder.iterdir()):
@@ -94,7 +97,7 @@ def export_dataset(
             raise DataError(f"{folder}: is not empty; name a new folder as `out`")
         if mark.read_bytes() != content:
             raise DataError(f"{folder}: holds another unfinished export; name a new folder as `out`")
-    splits = split_scenes(dataset.truth, val_share) if file_format == "yolo" else []
+    splits = split_scenes(dataset.truth, val_share) if file_format in SPLIT_FORMATS else []
     with lock_folder(make_folder(folder)):
         for part in filter(is_leftover, folder.rglob(".*.part")):  # of a killed run
             part.unlink()
@@ -248,8 +251,17 @@ def _to_json_numbers(column: NDArray[Any]) -> list[Any]:
     return [None if value != value else value for value in column.tolist()]
 
 
+def _export_parquet(dataset: Dataset | CocoDataset, folder: Path, progress: Progress, splits: list[str]) -> Path:
+    """Write Parquet for Hugging Face ``datasets``, and Croissant metadata."""
+    export_parquet(dataset, folder, progress, splits)
+    return write_croissant(dataset, folder, splits)
+
+
 EXPORT_FORMATS: dict[str, Callable[[Dataset | CocoDataset, Path, Progress, list[str]], Path]] = {
     "coco": _export_coco,
     "yolo": _export_yolo,
     "webdataset": _export_webdataset,
+    "parquet": _export_parquet,
 }
+SPLIT_FORMATS = ("yolo", "parquet")
+"""Formats that keep training and validation apart."""

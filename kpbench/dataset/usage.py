@@ -65,5 +65,25 @@ for sample in webdataset.WebDataset(sorted(glob.glob("shard-*.tar")), shardshuff
     print(sample["__key__"], image.shape, keypoints["x"], keypoints["y"], keypoints["patch_id"])
 ```
 """,
+    "parquet": """\
+Load the splits with `pip install datasets`:
+
+```python
+import datasets
+
+for row in datasets.load_dataset(".")["train"]:
+    print(row["image"].size, [(point["x"], point["y"], point["patch_id"]) for point in row["keypoints"]])
+```
+
+Or read `croissant.json` with `pip install mlcroissant`:
+
+```python
+import mlcroissant
+
+described = mlcroissant.Dataset("croissant.json")
+for record in described.records("train"):
+    print(record["train/image"], record["train/keypoints_x"], record["train/keypoints_y"])
+```
+""",
 }
 """By the format of an export."""

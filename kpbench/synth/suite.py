@@ -257,7 +257,7 @@ class SuiteConfig:
             pose = _pose(camera, board, drawn, inside_mm)
         else:
             rates = {key: levels[step] * (film.fps if key == "speed_px" else 1) for key, levels in condition.film}
-            moves = stream(self.seed, scene_id, SUITE_FILM)
+            moves = stage_rng(self.seed, scene_id, SUITE_FILM)
             path = draw_path(moves, camera, board, drawn["area_percent"], **{k: rates[k] for k in FILM_KEYS})
             pose = path.pose(frame / film.fps)
             record = film_record(film, frame, pose)
@@ -273,7 +273,7 @@ class SuiteConfig:
         if exposed and film:
             exposed = replace(exposed, motion=path.motion(frame / film.fps, film.exposure / film.fps))
         keypoints = exposed.keypoints(camera) if exposed else board_keypoints(camera, pose, board)
-        rng, size_px = stream(self.seed, scene_id, SUITE_EFFECT), (self.camera.width_px, self.camera.height_px)
+        rng, size_px = stage_rng(self.seed, scene_id, SUITE_EFFECT), (self.camera.width_px, self.camera.height_px)
         discs = discs_of(keypoints)
         effects = [draw_effect(rng, name, levels[step], size_px, discs) for name, levels in condition.effects]
         if film:
@@ -300,7 +300,7 @@ class SuiteConfig:
         background = self._find_background(view.scene_id, 3 if taken and needs_colour(taken) else 1)
         if taken and view.exposed:
             shot = view.scene_id * self._frames + index % self._frames
-            rng = stream(self.seed, shot, SUITE_SENSOR)
+            rng = stage_rng(self.seed, shot, SUITE_SENSOR)
             clean = photograph_board(background.image, view.camera, view.exposed, view.appearance, rng, taken)
         else:
             clean = render_board(background.image, self.camera, view.pose, view.board, view.appearance)

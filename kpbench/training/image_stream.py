@@ -62,7 +62,8 @@ class ImageStream(IterableDataset[Arrays]):
         self._digest = hashlib.sha256(canonical_json(describe_config(config)).encode()).hexdigest()
         survive_forks()
         # workers that stay between two passes share this memory, so that they see `set_epoch`
-        self._start = torch.zeros(2, dtype=torch.int64).share_memory_()
+        self._start = torch.zeros(2, dtype=torch.int64)
+        self._start.share_memory_()  # type: ignore[no-untyped-call]
         self._steps = 0
 
     @property
