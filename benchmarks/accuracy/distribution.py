@@ -62,7 +62,9 @@ def main() -> None:
     print(f"nearest two discs (as circles of their long axes): {min(gaps):.3f} px apart")
     inks, patches = [], shipped_patches()
     for n in range(len(dataset)):
-        placements = random_placements(stage_rng(dataset.config["seed"], n, SYNTH_SCENE), width, height, patches, Limits())
+        placements = random_placements(
+            stage_rng(dataset.config["seed"], n, SYNTH_SCENE), width, height, patches, Limits()
+        )
         rows = keypoints["H_patch2image"][truth.offsets[n] : truth.offsets[n + 1]]
         assert np.array_equal(
             rows.reshape(-1, 9), np.array([p.H_patch2image.ravel() for p in placements]).reshape(-1, 9)

@@ -89,7 +89,11 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
 @click.command()
 @DATASET
 @click.option(
-    "--format", "file_format", type=click.Choice(["coco", "yolo", "webdataset", "parquet"]), required=True, help="Format to write."
+    "--format",
+    "file_format",
+    type=click.Choice(["coco", "yolo", "webdataset", "parquet"]),
+    required=True,
+    help="Format to write.",
 )
 @click.option("--out", type=click.Path(path_type=Path), help="New folder to write into. Default: DATASET-FORMAT.")
 @click.option(

@@ -78,7 +78,10 @@ KEYPOINT_MEANINGS = {
 
 
 def write_croissant(dataset: Dataset | CocoDataset, folder: Path, splits: list[str]) -> Path:
-    """Write ``croissant.json`` beside an export to Parquet, and return it. Each split is a record set with a record per image."""
+    """Write ``croissant.json`` beside an export to Parquet, and return it.
+
+    Each split is a record set with a record per image.
+    """
     present = {split: name for split, name in HUB_SPLITS.items() if split in splits}
     images = describe_images(len(dataset), image_source(dataset.config))
     content = {

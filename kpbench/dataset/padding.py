@@ -24,11 +24,11 @@ def pad_sample(image: UInt8, keypoints: NDArray[Any], image_id: int, rows: int) 
     Returns
     -------
     dict of str to ndarray
-        ``image``, uint8, shape (1, H, W) or (3, H, W); ``image_id``, int64, shape (). The columns of the keypoints, with
-        the units of :data:`kpbench.KEYPOINT_DTYPE`: ``xy``, px, shape (rows, 2); ``patch_id``, int64, shape (rows,);
-        ``H_patch2image``, shape (rows, 3, 3); ``radius_major``, ``radius_minor``, ``axis_angle``, ``visible`` and
-        ``contrast``, shape (rows,). Columns of measured numbers are float32. Rows after the n-th have the patch_id -1
-        and zeros.
+        ``image``, uint8, shape (1, H, W) or (3, H, W); ``image_id``, int64, shape (). The columns of the keypoints,
+        with the units of :data:`kpbench.KEYPOINT_DTYPE`: ``xy``, px, shape (rows, 2); ``patch_id``, int64, shape
+        (rows,); ``H_patch2image``, shape (rows, 3, 3); ``radius_major``, ``radius_minor``, ``axis_angle``, ``visible``
+        and ``contrast``, shape (rows,). Columns of measured numbers are float32. Rows after the n-th have the patch_id
+        -1 and zeros.
 
     Examples
     --------

@@ -109,9 +109,7 @@ def _make_row(dataset: Dataset | CocoDataset, n: int) -> dict[str, Any]:
         "scene_id": int(truth.scene_id[n]),
         "condition": str(truth.condition[n]),
         "rung": _known(float(truth.rung[n])),
-        "keypoints": [
-            {name: _known(values[k]) for name, values in columns.items()} for k in range(len(keypoints))
-        ],
+        "keypoints": [{name: _known(values[k]) for name, values in columns.items()} for k in range(len(keypoints))],
         "degradations": json.dumps(dataset.effects(n)),
     }
 

@@ -69,9 +69,11 @@ for sample in webdataset.WebDataset(sorted(glob.glob("shard-*.tar")), shardshuff
 Load the splits with `pip install datasets`:
 
 ```python
+import os
+
 import datasets
 
-for row in datasets.load_dataset(".")["train"]:
+for row in datasets.load_dataset(os.getcwd())["train"]:
     print(row["image"].size, [(point["x"], point["y"], point["patch_id"]) for point in row["keypoints"]])
 ```
 

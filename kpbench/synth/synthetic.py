@@ -203,7 +203,9 @@ class SynthConfig:
         if self.distractors:
             rng = stage_rng(self.seed, index, SYNTH_LOOKALIKES)
             draw_lookalikes(background.image, rng, int(rng.integers(self.distractors + 1)), self.patches)
-        placements = random_placements(stage_rng(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits)
+        placements = random_placements(
+            stage_rng(self.seed, index, SYNTH_SCENE), width, height, self.patches, self.limits
+        )
         taken = list[Effect]()
         if self.camera is None:
             scene = render_scene(background.image, placements)

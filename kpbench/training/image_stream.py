@@ -74,9 +74,9 @@ class ImageStream(IterableDataset[Arrays]):
     def set_epoch(self, epoch: int) -> None:
         """Choose the epoch that the next pass shows. Call this before every pass of a training of several epochs.
 
-        Epoch e of a :class:`kpbench.SynthConfig` of n images shows the images e·n to (e + 1)·n − 1, so no image is shown
-        twice. Every epoch of another configuration shows the same images. A pass begins with the first image of its
-        epoch. Only the epoch that :meth:`load_state_dict` has set goes on where the state says.
+        Epoch e of a :class:`kpbench.SynthConfig` of n images shows the images e·n to (e + 1)·n - 1, so no image is
+        shown twice. Every epoch of another configuration shows the same images. A pass begins with the first image of
+        its epoch. Only the epoch that :meth:`load_state_dict` has set goes on where the state says.
         """
         if epoch != self.epoch:
             self._start[0], self._start[1], self._steps = epoch, 0, 0

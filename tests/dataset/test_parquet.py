@@ -1,4 +1,4 @@
-"""Exports to Parquet, with an independent reader: pyarrow, and where they are installed ``datasets`` and mlcroissant."""
+"""Exports to Parquet, read by pyarrow, and where they are installed by ``datasets`` and mlcroissant."""
 
 import io
 import json
