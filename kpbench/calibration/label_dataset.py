@@ -89,6 +89,10 @@ class _LabelConfig:
         width, height = self.content["size_px"]
         return int(width * height * self.content["channels"] * 0.8)
 
+    @property
+    def most_keypoints(self) -> int:
+        return max(map(len, self.keypoints), default=0)
+
     def to_dict(self) -> dict[str, Any]:
         return {**self.content, "n": self.n, "shard_size": self.shard_size}
 
