@@ -43,7 +43,7 @@ REJECTED_RADII = 0.02
 weights."""
 LAST_STEP_SHARE = 0.3
 """Standard deviation of the rest of the way, in last steps of the centre."""
-COLUMNS = 14
+UNKNOWN_COUNT = 14
 """Unknowns: grey, contrast, place (2), affine map (4), blur, tone, light along x and y, uneven blur (2)."""
 
 _ticks = (np.arange(GRID) + 0.5) / GRID * 2 - 1
@@ -133,12 +133,12 @@ def fit_samples(
         normal = (weighted @ np.swapaxes(J, 1, 2)).astype(np.float64)
         target = (weighted @ residual[..., None]).astype(np.float64)
         squares = np.einsum("nm,nm->n", weight, residual**2)
-        noise2 = np.maximum(squares / np.maximum(count - COLUMNS, 8), (LEAST_NOISE / contrast[:, 0]) ** 2)
+        noise2 = np.maximum(squares / np.maximum(count - UNKNOWN_COUNT, 8), (LEAST_NOISE / contrast[:, 0]) ** 2)
         fixed = *(np.inf,) * 4, *(EXPECTED_TURN,) * 4, 0.0, EXPECTED_TONE, EXPECTED_LIGHT, EXPECTED_LIGHT, 0.0, 0.0
         deviation = np.tile(fixed, (len(xy), 1))
         deviation[:, 8] = EXPECTED_BLUR_PX2 * per_px2
         deviation[:, 12:] = (EXPECTED_UNEVEN_PX2 * per_px2)[:, None]
-        normal[:, range(COLUMNS), range(COLUMNS)] += noise2[:, None] / deviation**2 + 1e-6
+        normal[:, range(UNKNOWN_COUNT), range(UNKNOWN_COUNT)] += noise2[:, None] / deviation**2 + 1e-6
         posterior = np.linalg.inv(normal)
         change = (posterior @ target)[..., 0]
         shift = change[:, 2:4] * np.minimum(1, 0.3 / np.maximum(np.abs(change[:, 2:4]).max(axis=1), 1e-9))[:, None]
