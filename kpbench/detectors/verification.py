@@ -132,13 +132,14 @@ def verify_candidates(
     >>> import kpbench
     >>> from kpbench.detectors import verify_candidates
     >>> patches = kpbench.shipped_patches()
-    >>> v, u = (np.mgrid[:96, :96] - 47.5) / 20.0
+    >>> v, u = (np.mgrid[:384, :384] - 191.5) / 80.0  # 4 x 4 samples a pixel
     >>> black = patches[1].is_black(np.stack([u, v], axis=-1))
-    >>> image = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210)).astype(np.uint8)
+    >>> grey = np.where(np.hypot(u, v) > 1, 120, np.where(black, 40, 210))
+    >>> image = grey.reshape(96, 4, 96, 4).mean(axis=(1, 3)).astype(np.uint8)
     >>> log_id = np.log(np.full((1, len(patches) + 1), 0.2))
     >>> found = verify_candidates(image, np.array([[48.0, 49.0]]), np.array([0.9]), log_id, patches)
-    >>> found.xy.round(), patches[found.design[0]].name
-    (array([[48., 48.]]), 'trefoil')
+    >>> found.xy.round(1), patches[found.design[0]].name
+    (array([[47.5, 47.5]]), 'trefoil')
     """
     pyramids = Pyramids(grey)
     with one_blas_thread():
