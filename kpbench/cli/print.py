@@ -29,7 +29,7 @@ from kpbench.cli.options import Finite, Two
     "--diameter-mm",
     type=Finite(0.1, 5000),
     metavar="MM",
-    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board. The side of a "
+    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board, 16 for a field. The side of a "
     "hexagon board is MM / 0.16.",
 )
 @click.option("--page", default="a4", show_default=True, help="Page: a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
@@ -42,7 +42,11 @@ from kpbench.cli.options import Finite, Two
     multiple=True,
     help="Also write the board for this program, into the subfolder targets; repeatable. Needs --board.",
 )
-@click.option("--board", metavar="hexagon|grid|truth|FILE.toml", help="Print a board instead of patches to cut out.")
+@click.option(
+    "--board", metavar="hexagon|grid|truth|field|FILE.toml", help="Print a board instead of patches to cut out."
+)
+@click.option("--rows", type=click.IntRange(3, 100), help="Rows of a field. Default: 10.")
+@click.option("--columns", type=click.IntRange(3, 100), help="Columns of a field. Default: 7.")
 @click.option("--reference", is_flag=True, help="Put a ring of reference marks around the board.")
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
@@ -85,6 +89,8 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
+    rows: int | None,
+    columns: int | None,
     targets: tuple[str, ...],
     reference: bool,
     tile: bool,
@@ -109,6 +115,7 @@ def render_patches(
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
       kpbench render-patches --board grid --target opencv --target kalibr
       kpbench render-patches --board truth --pdf
+      kpbench render-patches --board field --rows 11 --columns 8 --diameter-mm 14
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
@@ -130,7 +137,9 @@ def render_patches(
     patches = load_patches(designs) if designs else shipped_patches()
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
-    boards = load_boards(board, patches if designs or chosen else None, diameter_mm) if board is not None else ()
+    own = patches if designs or chosen else None
+    size = {name: count for name, count in (("rows", rows), ("columns", columns)) if count is not None}
+    boards = load_boards(board, own, diameter_mm, **size) if board is not None else ()
     if reference:
         boards = tuple(map(with_reference, boards))
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
@@ -161,5 +170,7 @@ def _check_usage(given: set[str], board: str | None) -> None:
         raise click.UsageError("--reference adds marks to a board; give --board.")
     if board is not None and "copies" in given:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
-    if board not in (None, "hexagon", "grid", "truth") and "chosen" in given:
+    if board != "field" and given & {"rows", "columns"}:
+        raise click.UsageError("--rows and --columns are the size of a --board field.")
+    if board not in (None, "hexagon", "grid", "truth", "field") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")
