@@ -1,0 +1,216 @@
+"""Lattices in detections: which patches are neighbours, and the row and the column of each in a lattice of its own.
+
+The frame of a patch tells where its eight neighbours are. Two patches that say so of each other are an edge. From a
+patch and its neighbours, a homography is fitted. It grows by the patches around it that lie on its lattice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kpbench.boards.candidates import determinants
+from kpbench.boards.frames import Frames, fit_homography
+from kpbench.types import Float, Int
+
+QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
+"""Rotations by 0 to 3 quarters from +x towards +y."""
+EDGE_ANGLE, EDGE_LENGTH, EDGE_TURN, EDGE_SCALE = 0.2, 0.4, 0.4, 0.7
+"""Largest errors of an edge: of its direction, rad, of the logarithm of its length, of the rotation between the frames
+of its two patches, rad, and of the logarithm of the ratio of their scales."""
+ROUNDS = 2
+"""Steps from the first patch to those of the first fit."""
+LEAST_PIECE = 4
+"""Smallest number of patches that make a lattice."""
+FITS = 10
+"""Largest number of fits of a homography as it grows."""
+FIRST_OFF = 0.6
+"""Largest distance of a patch from its place in the first fit, in disc radii."""
+MOST_BENT, MOST_SCALED, MOST_SCALED_MEMBER = 0.15, 0.2, 0.5
+"""Largest errors of a frame: of its shape and the logarithm of its scale, plus three standard deviations, to be fitted;
+of the logarithm of its scale, to belong to the lattice."""
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Pairs of neighbours, the best first: patch j is at ``step`` (E, 2) from patch i, as patch i is turned.
+
+    The frame of patch j is that of patch i, rotated by ``quarter`` (E,) quarters.
+    """
+
+    i: Int
+    j: Int
+    step: Int
+    quarter: Int
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Patches on one lattice.
+
+    ``rows`` (m,) are detections, ``cell`` (m, 2) their places (column, row), ``off`` (m,) their distances from these
+    places in disc radii. ``H`` maps the lattice, in disc radii, to the image. ``quarter`` (m,) is the rotation of each
+    frame, and ``fits`` (m,) tells whether the frame agrees with ``H``.
+    """
+
+    rows: Int
+    cell: Int
+    off: Float
+    H: Float
+    quarter: Int
+    fits: NDArray[np.bool_]
+
+
+def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit: float) -> list[Piece]:
+    """Return the lattices in detections, each detection once.
+
+    Parameters
+    ----------
+    frames : Frames
+        Detections with finite points and frames of positive determinant.
+    pitch : float
+        Distance of neighbours, in disc radii.
+    scale, shape : ndarray of shape (n,)
+        Standard deviations of each frame, see :func:`kpbench.boards.frames.frame_errors`.
+    limit : float
+        Largest distance of a patch from its place, in disc radii.
+    """
+    n = len(frames.xy)
+    inverse = np.linalg.inv(frames.A)
+    edges = _find_edges(frames, inverse, pitch)
+    degree = np.bincount(edges.i, minlength=n)
+    free, pieces = degree > 1, list[Piece]()
+    for seed in np.argsort(-degree, kind="stable").tolist():
+        if not free[seed]:
+            continue
+        free[seed] = False
+        start = _start(edges, seed, free)
+        if len(start[0]) < LEAST_PIECE:
+            continue
+        piece = _grow(frames, pitch, scale, shape, limit, start, free)
+        if piece is not None:
+            free[piece.rows] = False
+            pieces.append(piece)
+    return pieces
+
+
+def _find_edges(frames: Frames, inverse: Float, pitch: float) -> Edges:
+    to_step = inverse / pitch
+    dx, dy = (v - v[:, None] for v in frames.xy.T)
+    (a, b), (c, d) = to_step.transpose(1, 2, 0)[..., None]
+    u, v = a * dx + b * dy, c * dx + d * dy
+    near = u * u + v * v < 2 * np.exp(2 * EDGE_LENGTH)
+    i, j = np.nonzero(near & near.T)
+    off_diagonal = i != j
+    i, j = i[off_diagonal], j[off_diagonal]
+    turned = inverse[i] @ frames.A[j]
+    angle = np.arctan2(turned[:, 1, 0] - turned[:, 0, 1], turned[:, 0, 0] + turned[:, 1, 1])
+    quarter = np.rint(angle / (np.pi / 2)).astype(np.int64)
+    good = np.abs(angle - quarter * (np.pi / 2)) <= EDGE_TURN
+    good &= np.abs(np.log(np.maximum(determinants(turned), 1e-9))) / 2 <= EDGE_SCALE
+    there = np.stack([u[i, j], v[i, j]], axis=1)
+    back = (QUARTERS[quarter % 4] @ np.stack([u[j, i], v[j, i]], axis=1)[:, :, None])[:, :, 0]
+    mean = (there - back) / 2
+    good &= ((there + back) ** 2).sum(axis=1) <= (mean**2).sum(axis=1)
+    direction = np.arctan2(mean[:, 1], mean[:, 0])
+    eighth = np.rint(direction / (np.pi / 4))
+    step = np.rint(np.stack([np.cos(eighth * (np.pi / 4)), np.sin(eighth * (np.pi / 4))], axis=1) * 1.2).astype(int)
+    off_angle = np.abs(direction - eighth * (np.pi / 4))
+    length = np.sqrt((mean**2).sum(axis=1) / np.maximum((step**2).sum(axis=1), 1))
+    off_length = np.abs(np.log(np.maximum(length, 1e-9)))
+    good &= (off_angle <= EDGE_ANGLE) & (off_length <= EDGE_LENGTH)
+    best = np.flatnonzero(good)
+    best = best[np.argsort((off_angle / EDGE_ANGLE + off_length / EDGE_LENGTH)[best], kind="stable")]
+    return Edges(i[best], j[best], step[best], quarter[best] % 4)
+
+
+def _start(edges: Edges, seed: int, free: NDArray[np.bool_]) -> tuple[Int, Int, Int]:
+    """Return patches within a few edges of a seed, their cells relative to it, and the quarters of their frames."""
+    n = len(free)
+    cell, quarter, placed = np.zeros((n, 2), np.int64), np.zeros(n, np.int64), np.zeros(n, bool)
+    placed[seed] = True
+    for _ in range(ROUNDS):
+        e = np.flatnonzero(placed[edges.i] & ~placed[edges.j] & free[edges.j])
+        new, first = np.unique(edges.j[e], return_index=True)
+        e = e[first]
+        before = edges.i[e]
+        cell[new] = cell[before] + (QUARTERS[quarter[before]] @ edges.step[e][:, :, None])[:, :, 0]
+        quarter[new] = (quarter[before] + edges.quarter[e]) % 4
+        placed[new] = True
+    rows = np.flatnonzero(placed)
+    return rows, cell[rows], quarter[rows]
+
+
+def _grow(
+    frames: Frames,
+    pitch: float,
+    scale: Float,
+    shape: Float,
+    limit: float,
+    start: tuple[Int, Int, Int],
+    free: NDArray[np.bool_],
+) -> Piece | None:
+    """Fit a homography to patches, then to those around that lie on its lattice, until they stay."""
+    rows, cell, quarter = start
+    pool = np.flatnonzero(free)
+    pool = np.union1d(pool, rows)
+    xy, A = frames.xy[pool], frames.A[pool]
+    fitted, before, largest = rows, rows[:0], FIRST_OFF
+    for n in range(FITS):
+        J = frames.A[fitted] @ QUARTERS[-quarter % 4]
+        H = fit_homography(cell * pitch, frames.xy[fitted], J, scale[fitted], shape[fitted])
+        errors = _errors(H, xy, A, pitch)
+        if errors is None:
+            return None
+        all_cells, off, turned, scaled, bent = errors
+        low, high = cell.min(axis=0), cell.max(axis=0)
+        reach = max(2, int((high - low).max()) // 2)
+        near = ((all_cells >= low - reach) & (all_cells <= high + reach)).all(axis=1)
+        member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER)
+        fits = member & (scaled <= MOST_SCALED + 3 * scale[pool]) & (bent <= MOST_BENT + 3 * shape[pool])
+        at = _one_per_cell(np.flatnonzero(fits), all_cells, off)
+        if len(at) < LEAST_PIECE:
+            return None
+        fitted, cell, quarter = pool[at], all_cells[at], turned[at]
+        if n and np.array_equal(fitted, before):
+            break
+        before, largest = fitted, limit
+    at = _one_per_cell(np.flatnonzero(member), all_cells, off - fits)
+    return Piece(pool[at], all_cells[at], off[at], H, turned[at], fits[at])
+
+
+def _one_per_cell(rows: Int, cells: Int, off: Float) -> Int:
+    """Return some of the rows, in ascending order: of those of one cell, the one that is the least off."""
+    rows = rows[np.argsort(off[rows], kind="stable")]
+    key = cells[rows, 0] * 100_003 + cells[rows, 1]
+    return np.sort(rows[np.unique(key, return_index=True)[1]])
+
+
+def _errors(H: Float, xy: Float, A: Float, pitch: float) -> tuple[Int, Float, Int, Float, Float] | None:
+    """Return the nearest cell of each detection, and how far it is off, its quarters, and the errors of its frame.
+
+    The distance is in disc radii on the board. Detections that the homography cannot show are at infinity.
+    """
+    with np.errstate(all="ignore"):
+        try:
+            back = np.linalg.inv(H)
+        except np.linalg.LinAlgError:
+            return None
+        X = xy @ back[:2, :2].T + back[:2, 2]
+        X /= (xy @ back[2, :2] + back[2, 2])[:, None]
+        w = X @ H[2, :2] + H[2, 2]
+        (a, b), (c, d) = ((H[:2, :2] - xy[:, :, None] * H[2, :2]) / w[:, None, None]).transpose(1, 2, 0)
+        determinant = a * d - b * c
+        frame = (np.array([[d, -b], [-c, a]]) / determinant).transpose(2, 0, 1) @ A
+        scale = np.sqrt(determinants(frame))
+        angle = np.arctan2(frame[:, 1, 0] - frame[:, 0, 1], frame[:, 0, 0] + frame[:, 1, 1])
+        quarter = np.nan_to_num(np.rint(angle / (np.pi / 2))).astype(np.int64)
+        bent = np.sqrt(((frame / scale[:, None, None] - QUARTERS[quarter % 4]) ** 2).sum(axis=(1, 2)))
+        valid = (determinant > 0) & (w > 0) & np.isfinite(bent) & (np.abs(X).max(axis=1) < 1e6)
+        X[~valid] = 0.0
+        cell = np.rint(X / pitch).astype(np.int64)
+        off = np.where(valid, np.sqrt(((X - cell * pitch) ** 2).sum(axis=1)), np.inf)
+        scaled = np.where(valid, np.abs(np.log(scale)), np.inf)
+    return cell, off, quarter % 4, scaled, bent
