@@ -1,7 +1,7 @@
 """Patch fields in simulated detections: the share of patches that get their place, wrong places, time. No images.
 
 Each view shows a part of a field in random perspective: tilted by up to 60 degrees, in any rotation, with the edge of
-the field in view or not. Discs are 8 to 60 px wide at its middle. Points are wrong by 0.04 radii (standard deviation),
+the field in view or not. Discs are 8 to 150 px wide at its middle. Points are wrong by 0.04 radii (standard deviation),
 frames by what their designs do not tell. Conditions add missing patches, false alarms, wrong IDs (whose orientation is
 random, too), wrong orientations of all patches, and a lens that is not known.
 
@@ -62,7 +62,7 @@ def random_view(rng: np.random.Generator, board: Board) -> np.ndarray:
     R = np.eye(3) + np.sin(tilt) * cross + (1 - np.cos(tilt)) * cross @ cross
     c, s = np.cos(turn), np.sin(turn)
     R = R @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    z = focal * board.keypoints[0].diameter_mm / np.exp(rng.uniform(np.log(8), np.log(60)))
+    z = focal * board.keypoints[0].diameter_mm / np.exp(rng.uniform(np.log(8), np.log(150)))
     middle = rng.uniform(-0.5, 0.5, 2) * [board.side_x_mm, board.side_y_mm]
     t = np.array([0, 0, z]) - R @ np.append(middle, 0.0)
     K = np.array([[focal, 0, WIDTH / 2], [0, focal, HEIGHT / 2], [0, 0, 1]])

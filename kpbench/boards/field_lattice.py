@@ -17,13 +17,24 @@ from kpbench.types import Float, Int
 
 QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
 """Rotations by 0 to 3 quarters from +x towards +y."""
-EDGE_ANGLE, EDGE_LENGTH, EDGE_TURN, EDGE_SCALE = 0.2, 0.4, 0.4, 0.7
+EDGE_ANGLE, EDGE_LENGTH, EDGE_TURN, EDGE_SCALE = 0.2, 0.45, 0.4, 0.7
 """Largest errors of an edge: of its direction, rad, of the logarithm of its length, of the rotation between the frames
 of its two patches, rad, and of the logarithm of the ratio of their scales."""
-ROUNDS = 2
-"""Steps from the first patch to those of the first fit."""
+PERSPECTIVE = 0.1
+"""Standard deviation of the change of scale from a patch to its neighbour."""
+EDGE_SIGMAS = 2.5
+"""Largest error of the logarithm of the length of an edge, in standard deviations."""
+ROUNDS = (2, 1)
+"""Steps from the first patch to those of the first fit: at first, and if these do not fit."""
+LEAST_START = 0.75
+"""Part of the patches of the first fit that must fit."""
 LEAST_PIECE = 4
 """Smallest number of patches that make a lattice."""
+MANY, FRAMES_OF_MANY = 6, 30.0
+"""From ``MANY`` patches on, points tell the homography, and the errors of frames are taken to be larger by this factor:
+frames bias the perspective."""
+FAR = 100_003
+"""More than the rows of any field."""
 FITS = 10
 """Largest number of fits of a homography as it grows."""
 FIRST_OFF = 0.6
@@ -79,24 +90,24 @@ def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit:
     """
     n = len(frames.xy)
     inverse = np.linalg.inv(frames.A)
-    edges = _find_edges(frames, inverse, pitch)
+    edges = _find_edges(frames, inverse, pitch, scale)
     degree = np.bincount(edges.i, minlength=n)
     free, pieces = degree > 1, list[Piece]()
     for seed in np.argsort(-degree, kind="stable").tolist():
         if not free[seed]:
             continue
         free[seed] = False
-        start = _start(edges, seed, free)
-        if len(start[0]) < LEAST_PIECE:
-            continue
-        piece = _grow(frames, pitch, scale, shape, limit, start, free)
-        if piece is not None:
-            free[piece.rows] = False
-            pieces.append(piece)
+        for rounds in ROUNDS:
+            start = _start(edges, seed, free, rounds)
+            piece = _grow(frames, pitch, scale, shape, limit, start, free)
+            if piece is not None:
+                free[piece.rows] = False
+                pieces.append(piece)
+                break
     return pieces
 
 
-def _find_edges(frames: Frames, inverse: Float, pitch: float) -> Edges:
+def _find_edges(frames: Frames, inverse: Float, pitch: float, scale: Float) -> Edges:
     to_step = inverse / pitch
     dx, dy = (v - v[:, None] for v in frames.xy.T)
     (a, b), (c, d) = to_step.transpose(1, 2, 0)[..., None]
@@ -112,7 +123,10 @@ def _find_edges(frames: Frames, inverse: Float, pitch: float) -> Edges:
     good &= np.abs(np.log(np.maximum(determinants(turned), 1e-9))) / 2 <= EDGE_SCALE
     there = np.stack([u[i, j], v[i, j]], axis=1)
     back = (QUARTERS[quarter % 4] @ np.stack([u[j, i], v[j, i]], axis=1)[:, :, None])[:, :, 0]
-    mean = (there - back) / 2
+    weight = 1 / (scale**2 + PERSPECTIVE**2)
+    total = weight[i] + weight[j]
+    mean = (there * weight[i, None] - back * weight[j, None]) / total[:, None]
+    sigma = 1 / np.sqrt(total)
     good &= ((there + back) ** 2).sum(axis=1) <= (mean**2).sum(axis=1)
     direction = np.arctan2(mean[:, 1], mean[:, 0])
     eighth = np.rint(direction / (np.pi / 4))
@@ -120,23 +134,28 @@ def _find_edges(frames: Frames, inverse: Float, pitch: float) -> Edges:
     off_angle = np.abs(direction - eighth * (np.pi / 4))
     length = np.sqrt((mean**2).sum(axis=1) / np.maximum((step**2).sum(axis=1), 1))
     off_length = np.abs(np.log(np.maximum(length, 1e-9)))
-    good &= (off_angle <= EDGE_ANGLE) & (off_length <= EDGE_LENGTH)
+    good &= (off_angle <= EDGE_ANGLE) & (off_length <= np.minimum(EDGE_LENGTH, EDGE_SIGMAS * sigma))
     best = np.flatnonzero(good)
-    best = best[np.argsort((off_angle / EDGE_ANGLE + off_length / EDGE_LENGTH)[best], kind="stable")]
+    error = (2 * off_angle / EDGE_ANGLE) ** 2 + (off_length / sigma) ** 2 + sigma / PERSPECTIVE
+    best = best[np.argsort(error[best], kind="stable")]
     return Edges(i[best], j[best], step[best], quarter[best] % 4)
 
 
-def _start(edges: Edges, seed: int, free: NDArray[np.bool_]) -> tuple[Int, Int, Int]:
+def _start(edges: Edges, seed: int, free: NDArray[np.bool_], rounds: int) -> tuple[Int, Int, Int]:
     """Return patches within a few edges of a seed, their cells relative to it, and the quarters of their frames."""
     n = len(free)
     cell, quarter, placed = np.zeros((n, 2), np.int64), np.zeros(n, np.int64), np.zeros(n, bool)
     placed[seed] = True
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         e = np.flatnonzero(placed[edges.i] & ~placed[edges.j] & free[edges.j])
-        new, first = np.unique(edges.j[e], return_index=True)
-        e = e[first]
-        before = edges.i[e]
-        cell[new] = cell[before] + (QUARTERS[quarter[before]] @ edges.step[e][:, :, None])[:, :, 0]
+        e = e[np.sort(np.unique(edges.j[e], return_index=True)[1])]
+        before, new = edges.i[e], edges.j[e]
+        at = cell[before] + (QUARTERS[quarter[before]] @ edges.step[e][:, :, None])[:, :, 0]
+        taken = np.concatenate([cell[placed], at])
+        first = np.unique(taken[:, 0] * FAR + taken[:, 1], return_index=True)[1]
+        first = np.sort(first[first >= placed.sum()]) - placed.sum()
+        e, before, new, at = e[first], before[first], new[first], at[first]
+        cell[new] = at
         quarter[new] = (quarter[before] + edges.quarter[e]) % 4
         placed[new] = True
     rows = np.flatnonzero(placed)
@@ -154,13 +173,16 @@ def _grow(
 ) -> Piece | None:
     """Fit a homography to patches, then to those around that lie on its lattice, until they stay."""
     rows, cell, quarter = start
+    if len(rows) < LEAST_PIECE:
+        return None
     pool = np.flatnonzero(free)
     pool = np.union1d(pool, rows)
     xy, A = frames.xy[pool], frames.A[pool]
     fitted, before, largest = rows, rows[:0], FIRST_OFF
     for n in range(FITS):
         J = frames.A[fitted] @ QUARTERS[-quarter % 4]
-        H = fit_homography(cell * pitch, frames.xy[fitted], J, scale[fitted], shape[fitted])
+        weak = FRAMES_OF_MANY if len(fitted) >= MANY else 1.0
+        H = fit_homography(cell * pitch, frames.xy[fitted], J, weak * scale[fitted], weak * shape[fitted])
         errors = _errors(H, xy, A, pitch)
         if errors is None:
             return None
@@ -171,7 +193,7 @@ def _grow(
         member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER)
         fits = member & (scaled <= MOST_SCALED + 3 * scale[pool]) & (bent <= MOST_BENT + 3 * shape[pool])
         at = _one_per_cell(np.flatnonzero(fits), all_cells, off)
-        if len(at) < LEAST_PIECE:
+        if len(at) < LEAST_PIECE or (not n and len(at) < LEAST_START * len(rows)):
             return None
         fitted, cell, quarter = pool[at], all_cells[at], turned[at]
         if n and np.array_equal(fitted, before):
@@ -184,7 +206,7 @@ def _grow(
 def _one_per_cell(rows: Int, cells: Int, off: Float) -> Int:
     """Return some of the rows, in ascending order: of those of one cell, the one that is the least off."""
     rows = rows[np.argsort(off[rows], kind="stable")]
-    key = cells[rows, 0] * 100_003 + cells[rows, 1]
+    key = cells[rows, 0] * FAR + cells[rows, 1]
     return np.sort(rows[np.unique(key, return_index=True)[1]])
 
 
