@@ -92,11 +92,10 @@ def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit:
     inverse = np.linalg.inv(frames.A)
     edges = _find_edges(frames, inverse, pitch, scale)
     degree = np.bincount(edges.i, minlength=n)
-    free, pieces = degree > 1, list[Piece]()
+    free, is_seed, pieces = np.ones(n, bool), degree > 1, list[Piece]()
     for seed in np.argsort(-degree, kind="stable").tolist():
-        if not free[seed]:
+        if not free[seed] or not is_seed[seed]:
             continue
-        free[seed] = False
         for rounds in ROUNDS:
             start = _start(edges, seed, free, rounds)
             piece = _grow(frames, pitch, scale, shape, limit, start, free)
@@ -176,7 +175,6 @@ def _grow(
     if len(rows) < LEAST_PIECE:
         return None
     pool = np.flatnonzero(free)
-    pool = np.union1d(pool, rows)
     xy, A = frames.xy[pool], frames.A[pool]
     fitted, before, largest = rows, rows[:0], FIRST_OFF
     for n in range(FITS):
@@ -190,7 +188,7 @@ def _grow(
         low, high = cell.min(axis=0), cell.max(axis=0)
         reach = max(2, int((high - low).max()) // 2)
         near = ((all_cells >= low - reach) & (all_cells <= high + reach)).all(axis=1)
-        member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER)
+        member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER + 3 * scale[pool])
         fits = member & (scaled <= MOST_SCALED + 3 * scale[pool]) & (bent <= MOST_BENT + 3 * shape[pool])
         at = _one_per_cell(np.flatnonzero(fits), all_cells, off)
         if len(at) < LEAST_PIECE or (not n and len(at) < LEAST_START * len(rows)):
