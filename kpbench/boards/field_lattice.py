@@ -35,8 +35,10 @@ MANY, FRAMES_OF_MANY = 6, 30.0
 frames bias the perspective."""
 FAR = 100_003
 """More than the rows of any field."""
-FITS = 10
+FITS = 12
 """Largest number of fits of a homography as it grows."""
+MEDIANS, LEAST_CUT = 5.0, 0.12
+"""A patch that is fitted is at most this many times farther off than the median patch, or this far off, disc radii."""
 FIRST_OFF = 0.6
 """Largest distance of a patch from its place in the first fit, in disc radii."""
 MOST_BENT, MOST_SCALED, MOST_SCALED_MEMBER = 0.15, 0.2, 0.5
@@ -186,7 +188,7 @@ def _grow(
             return None
         all_cells, off, turned, scaled, bent = errors
         low, high = cell.min(axis=0), cell.max(axis=0)
-        reach = max(2, int((high - low).max()) // 2)
+        reach = max(1, int((high - low).max()) // 3) if n else 0
         near = ((all_cells >= low - reach) & (all_cells <= high + reach)).all(axis=1)
         member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER + 3 * scale[pool])
         fits = member & (scaled <= MOST_SCALED + 3 * scale[pool]) & (bent <= MOST_BENT + 3 * shape[pool])
@@ -196,7 +198,8 @@ def _grow(
         fitted, cell, quarter = pool[at], all_cells[at], turned[at]
         if n and np.array_equal(fitted, before):
             break
-        before, largest = fitted, limit
+        before, largest = fitted, min(limit, max(LEAST_CUT, MEDIANS * float(np.median(off[at]))))
+    member = near & (off <= limit) & (scaled <= MOST_SCALED_MEMBER + 3 * scale[pool])
     at = _one_per_cell(np.flatnonzero(member), all_cells, off - fits)
     return Piece(pool[at], all_cells[at], off[at], H, turned[at], fits[at])
 
