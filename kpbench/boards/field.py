@@ -19,7 +19,7 @@ from kpbench.patches.board import Board
 from kpbench.patches.lattice import Lattice
 from kpbench.types import Float, Int
 
-WRONG_LETTER, OUTSIDE = 0.05, 0.01
+WRONG_LETTER, OUTSIDE = 0.1, 0.01
 """Probability that a patch is read as another letter, and that a detection on the lattice is none of the field's."""
 OTHER_LETTERS = 0.02
 """Probability that a lattice is not that of the field."""

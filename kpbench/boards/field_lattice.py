@@ -37,7 +37,7 @@ FAR = 100_003
 """More than the rows of any field."""
 FITS = 12
 """Largest number of fits of a homography as it grows."""
-MEDIANS, LEAST_CUT = 5.0, 0.12
+MEDIANS, LEAST_CUT = 5.0, 0.2
 """A patch that is fitted is at most this many times farther off than the median patch, or this far off, disc radii."""
 FIRST_OFF = 0.6
 """Largest distance of a patch from its place in the first fit, in disc radii."""
@@ -188,7 +188,7 @@ def _grow(
             return None
         all_cells, off, turned, scaled, bent = errors
         low, high = cell.min(axis=0), cell.max(axis=0)
-        reach = max(1, int((high - low).max()) // 3) if n else 0
+        reach = max(2, int((high - low).max()) // 2) if n else 0
         near = ((all_cells >= low - reach) & (all_cells <= high + reach)).all(axis=1)
         member = near & (off <= largest) & (scaled <= MOST_SCALED_MEMBER + 3 * scale[pool])
         fits = member & (scaled <= MOST_SCALED + 3 * scale[pool]) & (bent <= MOST_BENT + 3 * shape[pool])
