@@ -39,6 +39,8 @@ FITS = 12
 """Largest number of fits of a homography as it grows."""
 MEDIANS, LEAST_CUT = 5.0, 0.2
 """A patch that is fitted is at most this many times farther off than the median patch, or this far off, disc radii."""
+LEAST_MEMBERS = 0.6
+"""Part of the detections between the patches of a lattice that must lie on it, too."""
 FIRST_OFF = 0.6
 """Largest distance of a patch from its place in the first fit, in disc radii."""
 MOST_BENT, MOST_SCALED, MOST_SCALED_MEMBER = 0.15, 0.2, 0.5
@@ -200,6 +202,10 @@ def _grow(
             break
         before, largest = fitted, min(limit, max(LEAST_CUT, MEDIANS * float(np.median(off[at]))))
     member = near & (off <= limit) & (scaled <= MOST_SCALED_MEMBER + 3 * scale[pool])
+    low, high = cell.min(axis=0), cell.max(axis=0)
+    among = ((all_cells >= low) & (all_cells <= high)).all(axis=1) & np.isfinite(off)
+    if (member & among).sum() < LEAST_MEMBERS * among.sum():
+        return None
     at = _one_per_cell(np.flatnonzero(member), all_cells, off - fits)
     return Piece(pool[at], all_cells[at], off[at], H, turned[at], fits[at])
 
