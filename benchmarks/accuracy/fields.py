@@ -6,6 +6,7 @@ frames by what their designs do not tell. Conditions add missing patches, false 
 random, too), wrong orientations of all patches, and a lens that is not known.
 
     python benchmarks/accuracy/fields.py [--patches 100000] [--seed 0] [--rows 10 --columns 7] [--only all]
+    python benchmarks/accuracy/fields.py --backgrounds photos/ --views 100 [--seed 0]    # semi-real, a detector
 
 A patch is placed rightly if it gets its point in a match that is not ambiguous. Only views in which the image shows a
 window of 3 x 3 patches, found or not, count for the share; all views count for wrong places.
@@ -16,13 +17,16 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 import kpbench
-from kpbench import Board, Detections
+from kpbench import Board, Detections, render_scene
 from kpbench.boards.frames import frame_errors
 from kpbench.geometry.homography import project
+from kpbench.render import Placement
 
 WIDTH, HEIGHT = 1280, 960
 POINT_SIGMA, TURN_SIGMA = 0.04, 0.05
@@ -150,6 +154,46 @@ def measure(name: str, board: Board, shown: Board, patches: int, seed: int) -> s
     return f"| {name} | {views} | {seen} | {share} | {wrong} | {alarms} | {np.median(ms):.1f} | {slow} |"
 
 
+def rendered_views(board: Board, count: int, seed: int, backgrounds: Path) -> str:
+    """Return a summary of views of a board that are painted into photographs and given to a detector (semi-real)."""
+    detector, rng = kpbench.load_detector("superpoint-small"), np.random.default_rng(seed)
+    photos = sorted(backgrounds.glob("*"))
+    seen = counted = right = wrong = alarms = 0
+    radius_mm = board.keypoints[0].diameter_mm / 2
+    for _ in range(count):
+        photo = cv2.imread(str(photos[rng.integers(len(photos))]), cv2.IMREAD_GRAYSCALE)
+        image, H = cv2.resize(photo, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), random_view(rng, board)
+        black, white = rng.uniform(20, 80), rng.uniform(150, 230)
+        side = np.array([board.side_x_mm, board.side_y_mm]) / 2
+        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side
+        if (corners @ H[2, :2] + H[2, 2]).min() <= 0:
+            continue
+        paper = cv2.fillPoly(image.copy(), [np.rint(project(H, corners)).astype(np.int32)], int(white))
+        placements = [Placement(k.patch, H @ k.H_patch2board, black, white) for k in board.keypoints]
+        X = board.points_mm[:, :2]
+        xy = project(H, X)
+        in_view = ((xy > 0) & (xy < [WIDTH, HEIGHT])).all(axis=1)
+        shown = render_scene(paper, [p for p, is_seen in zip(placements, in_view, strict=True) if is_seen]).image
+        blurred = cv2.GaussianBlur(shown, (0, 0), rng.uniform(0.4, 2.0)).astype(float)
+        found = detector(np.clip(blurred + rng.normal(0, rng.uniform(1, 8), blurred.shape), 0, 255).astype(np.uint8))
+        distance = np.linalg.norm(found.xy[:, None] - xy, axis=2)
+        radius = radius_mm * np.sqrt(np.abs(np.linalg.det(derivatives(H, X, xy))))
+        nearest = (distance / radius).argmin(axis=1)
+        true = np.where((distance / radius).min(axis=1) < 0.5, nearest, -1)
+        points = np.full(len(found), -1)
+        for match in kpbench.find_board(found, board):
+            if not match.ambiguous:
+                points[match.index] = match.points
+        patch = true >= 0
+        whole = np.lib.stride_tricks.sliding_window_view(in_view[board.lattice.points], (3, 3)).all(axis=(2, 3)).any()
+        seen, wrong = seen + int(patch.sum()), wrong + int((patch & (points >= 0) & (points != true)).sum())
+        alarms += int((~patch & (points >= 0)).sum())
+        if whole:
+            counted, right = counted + int(patch.sum()), right + int((patch & (points == true)).sum())
+    share = f"{right / counted:.4f}" if counted else "-"
+    return f"{count} views, {seen} patches detected, placed rightly {share}, wrong {wrong}, false alarms {alarms}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--patches", type=int, default=100_000)
@@ -157,11 +201,18 @@ def main() -> None:
     parser.add_argument("--rows", type=int, default=10)
     parser.add_argument("--columns", type=int, default=7)
     parser.add_argument("--only", choices=CONDITIONS)
+    parser.add_argument("--backgrounds", type=Path, help="Photographs: render views, and detect with superpoint-small.")
+    parser.add_argument("--views", type=int, default=100)
     args = parser.parse_args()
     patches = kpbench.shipped_patches()
     board = kpbench.field_board(patches, args.rows, args.columns)
+    if args.backgrounds:
+        print(f"{board.name}, seed {args.seed}: {rendered_views(board, args.views, args.seed, args.backgrounds)}")
+        return
     print(f"{board.name}, seed {args.seed}, simulated detections\n")
-    print("| condition | views | patches | placed rightly | views placed | wrong places | placed false alarms |", end="")
+    print(
+        "| condition | views | patches | placed rightly | views placed | wrong places | placed false alarms |", end=""
+    )
     print(" ms | ms at 200 |\n|" + "---|" * 9)
     for name in [args.only] if args.only else CONDITIONS:
         shown = board

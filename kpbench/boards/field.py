@@ -75,7 +75,7 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
     errors = np.array([frame_errors(designs[key]) for key in ids.tolist()])
     order = np.array([designs[key].symmetry_order for key in ids.tolist()])
     read = np.searchsorted(ids, patch_id[index])
-    scale, shape = errors[read].T
+    scale, shape = np.asarray(errors[read].T, np.float64)
     frames = frames[index]
     found = list[FieldMatch]()
     for piece in find_pieces(frames, lattice.pitch, scale, shape, limit):
@@ -156,17 +156,22 @@ def _join(found: list[FieldMatch], board: Board, lattice: Lattice, index: Int, f
             if not is_sure or other.probability < LEAST_PROBABILITY or np.isin(match.points, other.points).any():
                 continue
             X = (board.points_mm[match.points, :2] - origin) / radius_mm
-            near = np.argmin(((X[:, None] - (board.points_mm[other.points, :2] - origin) / radius_mm) ** 2).sum(2).min(1))
+            near = np.argmin(
+                ((X[:, None] - (board.points_mm[other.points, :2] - origin) / radius_mm) ** 2).sum(2).min(1)
+            )
             seen = other.H @ np.append(X[near], 1.0)
             detection = int(np.searchsorted(index, match.rows[near]))
             off = np.linalg.inv(frames.A[detection]) @ (frames.xy[detection] - seen[:2] / seen[2])
             if seen[2] > 0 and np.hypot(*off) <= SAME_SHEET * lattice.pitch:
-                parts = (np.concatenate([getattr(m, name) for m in (other, match)]) for name in FIELDS_JOINED)
-                joined[n] = FieldMatch(*parts, min(other.probability, match.probability), other.H)
+                joined[n] = FieldMatch(
+                    np.concatenate([other.rows, match.rows]),
+                    np.concatenate([other.points, match.points]),
+                    np.concatenate([other.turn, match.turn]),
+                    np.concatenate([other.agrees, match.agrees]),
+                    min(other.probability, match.probability),
+                    other.H,
+                )
                 break
         else:
             joined.append(match)
     return sorted(joined, key=lambda m: -len(m.rows))
-
-
-FIELDS_JOINED = ("rows", "points", "turn", "agrees")

@@ -93,7 +93,7 @@ def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit:
         Largest distance of a patch from its place, in disc radii.
     """
     n = len(frames.xy)
-    inverse = np.linalg.inv(frames.A)
+    inverse = np.asarray(np.linalg.inv(frames.A), np.float64)
     edges = _find_edges(frames, inverse, pitch, scale)
     degree = np.bincount(edges.i, minlength=n)
     free, is_seed, pieces = np.ones(n, bool), degree > 1, list[Piece]()
@@ -182,7 +182,7 @@ def _grow(
     xy, A = frames.xy[pool], frames.A[pool]
     fitted, before, largest = rows, rows[:0], FIRST_OFF
     for n in range(FITS):
-        J = frames.A[fitted] @ QUARTERS[-quarter % 4]
+        J = np.asarray(frames.A[fitted] @ QUARTERS[-quarter % 4], np.float64)
         weak = FRAMES_OF_MANY if len(fitted) >= MANY else 1.0
         H = fit_homography(cell * pitch, frames.xy[fitted], J, weak * scale[fitted], weak * shape[fitted])
         errors = _errors(H, xy, A, pitch)

@@ -108,7 +108,8 @@ def load_boards(
     ----------
     name : str or Path
         "hexagon" for a hexagon board per design, "grid" for one grid of 4 rows and 3 columns, "truth" for
-        :func:`kpbench.truth_board`, "field" for :func:`kpbench.field_board`, or a file as for :func:`kpbench.load_board`.
+        :func:`kpbench.truth_board`, "field" for :func:`kpbench.field_board`, or a file as for
+        :func:`kpbench.load_board`.
     patches : sequence of Patch, optional
         Designs on the boards. Default: the shipped designs, or as in the file.
     diameter_mm : float, optional

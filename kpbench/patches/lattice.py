@@ -89,13 +89,14 @@ def field_distance(letters: Int, window: tuple[int, int] = WINDOW) -> int:
     (1, 0)
     """
     words = window_words(letters, window).astype(np.int8)
-    least, step = words.shape[1], max(1, WORDS_AT_ONCE // max(1, words.size))
+    places = window[0] * window[1]
+    least, step = places, max(1, WORDS_AT_ONCE // max(1, words.size))
     for first in range(0, len(words), step):
         part, rest = words[first : first + step], words[first:]
         differ = np.zeros((len(part), len(rest)), np.int8)
-        for k in range(words.shape[1]):
+        for k in range(places):
             differ += part[:, k, None] != rest[:, k]
-        differ[np.arange(len(part)), np.arange(len(part))] = words.shape[1]
+        differ[np.arange(len(part)), np.arange(len(part))] = places
         least = min(least, int(differ.min()))
     return least
 

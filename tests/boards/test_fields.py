@@ -116,7 +116,7 @@ def test_a_bent_sheet_is_found_as_one():
 def test_two_copies_are_two_matches():
     one, other = flat(BOARD, 10, 2.0), flat(BOARD, 200, 2.0)
     both = Detections(
-        np.concatenate([one.xy, other.xy + [900, 100]]),
+        np.concatenate([one.xy, other.xy + np.array([900, 100])]),
         np.ones(140),
         np.concatenate([one.patch_id, other.patch_id]),
         np.concatenate([one.A_patch2image, other.A_patch2image]),

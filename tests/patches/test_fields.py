@@ -20,7 +20,7 @@ spec.loader.exec_module(search_fields)
 
 
 def words_one_by_one(letters, rows, columns):
-    """The words of all windows of a field in four rotations, by indices alone: row r, column c go to c, rows - 1 - r."""
+    """The words of all windows of a field in four rotations, by indices alone."""
     words = []
     for top, left in itertools.product(range(len(letters) - rows + 1), range(len(letters[0]) - columns + 1)):
         window = {(r, c): letters[top + r][left + c] for r in range(rows) for c in range(columns)}
@@ -39,7 +39,7 @@ def test_every_window_of_a_field_differs_from_all_others_in_all_rotations(distan
     if len(words) < 1500:
         pairs = itertools.combinations(words, 2)
         assert min(sum(a != b for a, b in zip(*pair, strict=True)) for pair in pairs) == distance
-    else:  # no word has another one within distance - 1: none shares a neighbour of the half distance
+    else:
         table = np.array(words, np.int8)
         least = 9
         for n in range(len(table) - 1):
@@ -49,7 +49,10 @@ def test_every_window_of_a_field_differs_from_all_others_in_all_rotations(distan
 
 
 def test_windows_of_2_x_2_of_the_small_field_differ_in_all_rotations():
-    letters = [list(map(int, line)) for line in (shipped_folder("patches") / "fields" / "2x2-distance-1.txt").read_text().split()]
+    letters = [
+        list(map(int, line))
+        for line in (shipped_folder("patches") / "fields" / "2x2-distance-1.txt").read_text().split()
+    ]
     words = words_one_by_one(letters, 2, 2)
     assert len({*words}) == len(words) == 4 * 49
     assert field_distance(np.array(letters), (2, 2)) == 1
@@ -73,7 +76,9 @@ def test_a_search_keeps_its_promise_and_repeats_itself():
     assert field_distance(fields[0].astype(int)) >= 3
 
 
-@pytest.mark.parametrize(("rows", "columns", "least"), [(5, 6, 5), (6, 5, 5), (10, 7, 4), (8, 11, 4), (19, 16, 3), (40, 50, 2)])
+@pytest.mark.parametrize(
+    ("rows", "columns", "least"), [(5, 6, 5), (6, 5, 5), (10, 7, 4), (8, 11, 4), (19, 16, 3), (40, 50, 2)]
+)
 def test_a_board_has_the_letters_of_the_best_field_that_is_large_enough(rows, columns, least):
     board = field_board(shipped_patches(), rows, columns)
     assert board.lattice.ids.shape == (rows, columns)
