@@ -184,7 +184,9 @@ def _grow(
     for n in range(FITS):
         J = np.asarray(frames.A[fitted] @ QUARTERS[-quarter % 4], np.float64)
         weak = FRAMES_OF_MANY if len(fitted) >= MANY else 1.0
-        H = fit_homography(cell * pitch, frames.xy[fitted], J, weak * scale[fitted], weak * shape[fitted])
+        H = fit_homography(
+            np.asarray(cell * pitch, np.float64), frames.xy[fitted], J, weak * scale[fitted], weak * shape[fitted]
+        )
         errors = _errors(H, xy, A, pitch)
         if errors is None:
             return None

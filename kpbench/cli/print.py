@@ -29,8 +29,8 @@ from kpbench.cli.options import Finite, Two
     "--diameter-mm",
     type=Finite(0.1, 5000),
     metavar="MM",
-    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board, 16 for a field. The side of "
-    "a hexagon board is MM / 0.16.",
+    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board, 16 for a field. The "
+    "side of a hexagon board is MM / 0.16.",
 )
 @click.option("--page", default="a4", show_default=True, help="Page: a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
 @click.option("--landscape", is_flag=True, help="Use the page in landscape format.")
