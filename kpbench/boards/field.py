@@ -29,9 +29,6 @@ LEAST_PROBABILITY = 0.999
 """Least probability of a place that is sure."""
 OFF_WRONG_LETTER = 0.5
 """Largest distance of a patch that is read as another letter, as a part of that of other patches."""
-MOST_BENT, MOST_SCALED = 0.15, 0.2
-"""Largest errors of the shape and of the logarithm of the scale of a frame that agrees, plus three of its standard
-deviations."""
 SAME_SHEET = 1.0
 """Largest distance between two lattices of one bent sheet, as either predicts the other, in pitches."""
 

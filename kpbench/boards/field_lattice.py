@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.boards.candidates import determinants
-from kpbench.boards.frames import Frames, fit_homography
+from kpbench.boards.frames import MOST_BENT, MOST_SCALED, Frames, fit_homography
 from kpbench.types import Float, Int
 
 QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
@@ -24,7 +24,7 @@ PERSPECTIVE = 0.1
 """Standard deviation of the change of scale from a patch to its neighbour."""
 EDGE_SIGMAS = 2.5
 """Largest error of the logarithm of the length of an edge, in standard deviations."""
-ROUNDS = (2, 1)
+START_ROUNDS = (2, 1)
 """Steps from the first patch to those of the first fit: at first, and if these do not fit."""
 LEAST_START = 0.75
 """Part of the patches of the first fit that must fit."""
@@ -43,9 +43,8 @@ LEAST_MEMBERS = 0.6
 """Part of the detections between the patches of a lattice that must lie on it, too."""
 FIRST_OFF = 0.6
 """Largest distance of a patch from its place in the first fit, in disc radii."""
-MOST_BENT, MOST_SCALED, MOST_SCALED_MEMBER = 0.15, 0.2, 0.5
-"""Largest errors of a frame: of its shape and the logarithm of its scale, plus three standard deviations, to be fitted;
-of the logarithm of its scale, to belong to the lattice."""
+MOST_SCALED_MEMBER = 0.5
+"""Largest error of the logarithm of the scale of a patch of the lattice, plus three standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +99,7 @@ def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit:
     for seed in np.argsort(-degree, kind="stable").tolist():
         if not free[seed] or not is_seed[seed]:
             continue
-        for rounds in ROUNDS:
+        for rounds in START_ROUNDS:
             start = _start(edges, seed, free, rounds)
             piece = _grow(frames, pitch, scale, shape, limit, start, free)
             if piece is not None:

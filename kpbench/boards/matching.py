@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kpbench.boards.candidates import PointCandidates, confirm_pairs, homography_errors, make_candidates
 from kpbench.boards.field import LEAST_PROBABILITY, FieldMatch, match_field
-from kpbench.boards.frames import POINT_SIGMA, Frames, fit_homography, straighten
+from kpbench.boards.frames import MOST_BENT, MOST_SCALED, POINT_SIGMA, Frames, fit_homography, straighten
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
@@ -32,8 +32,6 @@ MOST_OFF, MOST_OFF_BENT = 0.2, 0.35
 """Largest distance of a detection from its point on the board, in disc radii: with a camera, and without one."""
 MOST_OFF_FIRST = 0.9
 """The same for the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
-MOST_BENT, MOST_SCALED = 0.15, 0.2
-"""Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
 WORTH_FITTING = 0.9
 """A candidate is fitted if its confirmations are at least this part of those of the best fit with its detection."""
 SURE_SCORE, SHARP_BLUR = 0.9, 0.15

@@ -45,8 +45,8 @@ from kpbench.cli.options import Finite, Two
 @click.option(
     "--board", metavar="hexagon|grid|truth|field|FILE.toml", help="Print a board instead of patches to cut out."
 )
-@click.option("--rows", type=click.IntRange(3, 100), help="Rows of a field. Default: 10.")
-@click.option("--columns", type=click.IntRange(3, 100), help="Columns of a field. Default: 7.")
+@click.option("--rows", type=click.IntRange(3, 100), default=10, show_default=True, help="Rows of a field.")
+@click.option("--columns", type=click.IntRange(3, 100), default=7, show_default=True, help="Columns of a field.")
 @click.option("--reference", is_flag=True, help="Put a ring of reference marks around the board.")
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
@@ -89,8 +89,8 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
-    rows: int | None,
-    columns: int | None,
+    rows: int,
+    columns: int,
     targets: tuple[str, ...],
     reference: bool,
     tile: bool,
@@ -138,8 +138,7 @@ def render_patches(
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
     own = patches if designs or chosen else None
-    size = {name: count for name, count in (("rows", rows), ("columns", columns)) if count is not None}
-    boards = load_boards(board, own, diameter_mm, **size) if board is not None else ()
+    boards = load_boards(board, own, diameter_mm, rows=rows, columns=columns) if board is not None else ()
     if reference:
         boards = tuple(map(with_reference, boards))
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]

@@ -16,7 +16,7 @@ from kpbench.types import Float, Int
 WINDOW = (3, 3)
 LEAST_PLACES = 21
 """A smaller board is not decoded as a field. Some small grids of a regular pattern have different windows, too."""
-SAME_MM = 1e-3
+EVEN_MM = 1e-3
 """Lengths that differ by less are the same."""
 WORDS_AT_ONCE = 2**24
 """Pairs of words that are compared at a time."""
@@ -86,7 +86,7 @@ def field_distance(letters: Int, window: tuple[int, int] = WINDOW) -> int:
     >>> import numpy as np
     >>> from kpbench.patches import field_distance
     >>> field_distance(np.array([[0, 1, 1], [0, 0, 2]]), (2, 2)), field_distance(np.zeros((3, 4), int))
-    (1, 0)
+    (2, 0)
     """
     words = window_words(letters, window).astype(np.int8)
     places = window[0] * window[1]
@@ -118,7 +118,7 @@ def find_lattice(points_mm: Float, ids: Int, rotate_deg: Float, diameter_mm: Flo
     if len(ids) < LEAST_PLACES or len(x) * len(y) != len(ids) or min(len(x), len(y)) < WINDOW[0]:
         return None
     steps = np.concatenate([np.diff(x), np.diff(y)])
-    if max(np.ptp(steps), np.ptp(diameter_mm), np.ptp(rotate_deg), abs(rotate_deg[0])) > 2 * SAME_MM:
+    if max(np.ptp(steps), np.ptp(diameter_mm), np.ptp(rotate_deg), abs(rotate_deg[0])) > 2 * EVEN_MM:
         return None
     points = np.full((len(y), len(x)), -1)
     points[row, column] = np.arange(len(ids))
