@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import Finite, Two
+
+if TYPE_CHECKING:
+    from kpbench.patches.board import Board
 
 
 @click.command("render-patches")
@@ -122,7 +126,6 @@ def render_patches(
     from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch, load_boards
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.patches.reference_boards import with_reference
-    from kpbench.patches.symmetry import pose_problem
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
     from kpbench.printing.sidecar import correct_sidecars
@@ -149,12 +152,18 @@ def render_patches(
             files = [*print_boards(boards, out, tile=tile, **layout), *write_targets(boards, out, targets)]
         else:
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
-    for path in files:
-        echo(path)
-    for printed in boards:
-        if problem := pose_problem(printed):
-            print_warning(f"the pose of board {printed.name} is not unique: {problem}")
+    echo("\n".join(map(str, files)))
+    _warn_of_poses(boards)
     echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
+
+
+def _warn_of_poses(boards: Sequence[Board]) -> None:
+    """Print a warning for each board whose pose is not unique."""
+    from kpbench.patches.symmetry import pose_problem
+
+    for board in boards:
+        if problem := pose_problem(board):
+            print_warning(f"the pose of board {board.name} is not unique: {problem}")
 
 
 def _check_usage(given: set[str], board: str | None) -> None:
