@@ -152,7 +152,8 @@ def render_patches(
             files = [*print_boards(boards, out, tile=tile, **layout), *write_targets(boards, out, targets)]
         else:
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
-    echo("\n".join(map(str, files)))
+    for path in files:
+        echo(path)
     _warn_of_poses(boards)
     echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
 
