@@ -5,13 +5,13 @@ rotations of one place, differ in at least ``--distance`` letters. The search fi
 letter fits, it takes back the last letters, and more of them each time in vain. It stops after
 ``--steps``, and writes the rows that are complete. The same seed and steps give the same field.
 
-The shipped fields are the output of:
+The shipped fields are the output of these, each with ``--out FILE.txt``:
 
-    python benchmarks/designs/search_fields.py --distance 5 --rows 6 --columns 6 --steps 200000 --seed 0 --out FILE.txt
-    python benchmarks/designs/search_fields.py --distance 4 --rows 12 --columns 8 --steps 600000 --seed 2 --out FILE.txt
-    python benchmarks/designs/search_fields.py --distance 3 --rows 24 --columns 16 --steps 400000 --seed 0 --out FILE.txt
-    python benchmarks/designs/search_fields.py --distance 2 --rows 60 --columns 50 --steps 60000 --seed 0 --out FILE.txt
-    python benchmarks/designs/search_fields.py --window 2x2 --distance 1 --rows 8 --columns 8 --steps 20000 --out FILE.txt
+    python benchmarks/designs/search_fields.py --distance 5 --rows 6 --columns 6 --steps 200000 --seed 0
+    python benchmarks/designs/search_fields.py --distance 4 --rows 12 --columns 8 --steps 600000 --seed 2
+    python benchmarks/designs/search_fields.py --distance 3 --rows 24 --columns 16 --steps 400000 --seed 0
+    python benchmarks/designs/search_fields.py --distance 2 --rows 60 --columns 50 --steps 60000 --seed 0
+    python benchmarks/designs/search_fields.py --window 2x2 --distance 1 --rows 8 --columns 8 --steps 20000
 """
 
 from __future__ import annotations
