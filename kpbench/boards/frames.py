@@ -18,6 +18,8 @@ from kpbench.types import Detections, Float, Int
 
 POINT_SIGMA = 0.03
 """Standard deviation of a point, in disc radii, for finding a board."""
+MOST_BENT, MOST_SCALED = 0.15, 0.2
+"""Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
 RIDGE = 1e-12
 """Part of their diagonal that is added to normal equations, so that they can always be solved."""
 KNOWN, UNKNOWN_SCALE, UNKNOWN_SHAPE = 0.03, 0.25, 0.1

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.boards.candidates import PointCandidates, confirm_pairs, homography_errors, make_candidates
-from kpbench.boards.frames import POINT_SIGMA, Frames, fit_homography, straighten
+from kpbench.boards.field import LEAST_PROBABILITY, FieldMatch, match_field
+from kpbench.boards.frames import MOST_BENT, MOST_SCALED, POINT_SIGMA, Frames, fit_homography, straighten
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
 from kpbench.patches.board import Board
@@ -31,8 +32,6 @@ MOST_OFF, MOST_OFF_BENT = 0.2, 0.35
 """Largest distance of a detection from its point on the board, in disc radii: with a camera, and without one."""
 MOST_OFF_FIRST = 0.9
 """The same for the first fit, which extrapolates. Discs do not overlap, so the nearest point is the right one."""
-MOST_BENT, MOST_SCALED = 0.15, 0.2
-"""Largest errors of the shape and of the logarithm of the scale of a frame, plus three of its standard deviations."""
 WORTH_FITTING = 0.9
 """A candidate is fitted if its confirmations are at least this part of those of the best fit with its detection."""
 SURE_SCORE, SHARP_BLUR = 0.9, 0.15
@@ -68,6 +67,8 @@ class BoardMatch:
     is_sure : bool
         False if the points are few and fit badly, or if nothing but the orientation of the patches tells the points
         and blur makes the orientation doubtful.
+    probability : float
+        On a field, the probability of the points; 1 on other boards, where ``alternatives`` tells what else may be.
     camera : Camera or None
         Camera with which the board was found.
     frames : Frames or None
@@ -93,6 +94,7 @@ class BoardMatch:
     agrees: NDArray[np.bool_]
     alternatives: tuple[BoardMatch, ...] = ()
     is_sure: bool = True
+    probability: float = 1.0
     camera: Camera | None = None
     frames: Frames | None = None
 
@@ -132,7 +134,9 @@ class Explanation:
 def find_board(detections: Detections, board: Board, camera: Camera | None = None) -> tuple[BoardMatch, ...]:
     """Find which detection is which keypoint of a board.
 
-    A board is found from three of its patches on. False alarms, missing patches and several copies of the board do not
+    A field (:func:`kpbench.field_board`) is found from any part of it that tells its place, about 3 x 3 patches, and
+    patches that are read as another letter get their points, too. Other boards are found from three of their patches
+    on. False alarms, missing patches and several copies of the board do not
     matter. Without a camera, a lens may bend the board by about a third of a disc's radius.
 
     Parameters
@@ -176,6 +180,9 @@ def find_board(detections: Detections, board: Board, camera: Camera | None = Non
         raise DataError("the detector gives no patch IDs, which a board needs")
     frames = straighten(detections, camera)
     limit = MOST_OFF_BENT if camera is None else MOST_OFF
+    if board.lattice is not None:
+        fields = match_field(frames, detections.patch_id, board, board.lattice, limit)
+        return tuple(_make_field_match(field, detections, board, frames, camera) for field in fields)
     candidates = make_candidates(frames, detections.patch_id, board)
     explanations, left = list[Explanation](), np.argsort(-detections.score, kind="stable")
     left = left[np.isin(left, candidates.detection)]
@@ -278,10 +285,24 @@ def _choose(
         is_sure = _has_sharp_patches(found) or not _depends_on_frames(c.point, board)
         is_sure &= e.count > FEW or e.cost_per_freedom <= FEW_COST
         return BoardMatch(
-            board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), is_sure, camera, straight
+            board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), is_sure, 1.0, camera, straight
         )
 
     return tuple(make(*group) for group in chosen)
+
+
+def _make_field_match(
+    field: FieldMatch, detections: Detections, board: Board, frames: Frames, camera: Camera | None
+) -> BoardMatch:
+    order = np.argsort(field.rows)
+    rows, turn = field.rows[order], field.turn[order]
+    found, straight = detections[rows], frames[rows]
+    assert found.A_patch2image is not None
+    found = replace(found, A_patch2image=found.A_patch2image @ turn)
+    straight = replace(straight, A=straight.A @ turn)
+    of_board = board, rows, field.points[order], found, field.agrees[order], ()
+    is_sure = field.probability >= LEAST_PROBABILITY
+    return BoardMatch(*of_board, is_sure, field.probability, camera, straight)
 
 
 def _has_sharp_patches(found: Detections) -> bool:

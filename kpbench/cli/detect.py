@@ -51,7 +51,7 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
 @click.option(
     "--board",
     "board_names",
-    metavar="hexagon|grid|FILE",
+    metavar="hexagon|grid|field|FILE",
     multiple=True,
     help="Board to find: a name, the JSON sidecar of its print, or its TOML file; repeatable.",
 )

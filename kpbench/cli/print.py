@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from kpbench.cli.messages import echo, print_warning
 from kpbench.cli.options import Finite, Two
+
+if TYPE_CHECKING:
+    from kpbench.patches.board import Board
 
 
 @click.command("render-patches")
@@ -29,8 +33,8 @@ from kpbench.cli.options import Finite, Two
     "--diameter-mm",
     type=Finite(0.1, 5000),
     metavar="MM",
-    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board. The side of a "
-    "hexagon board is MM / 0.16.",
+    help="Diameter of a disc, without rim and quiet zone. Default: 30, or 24 for the truth board, 16 for a field. The "
+    "side of a hexagon board is MM / 0.16.",
 )
 @click.option("--page", default="a4", show_default=True, help="Page: a4, a3, a2, letter, legal or WIDTHxHEIGHTmm.")
 @click.option("--landscape", is_flag=True, help="Use the page in landscape format.")
@@ -42,7 +46,11 @@ from kpbench.cli.options import Finite, Two
     multiple=True,
     help="Also write the board for this program, into the subfolder targets; repeatable. Needs --board.",
 )
-@click.option("--board", metavar="hexagon|grid|truth|FILE.toml", help="Print a board instead of patches to cut out.")
+@click.option(
+    "--board", metavar="hexagon|grid|truth|field|FILE.toml", help="Print a board instead of patches to cut out."
+)
+@click.option("--rows", type=click.IntRange(3, 100), default=10, show_default=True, help="Rows of a field.")
+@click.option("--columns", type=click.IntRange(3, 100), default=7, show_default=True, help="Columns of a field.")
 @click.option("--reference", is_flag=True, help="Put a ring of reference marks around the board.")
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
@@ -85,6 +93,8 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
+    rows: int,
+    columns: int,
     targets: tuple[str, ...],
     reference: bool,
     tile: bool,
@@ -109,13 +119,13 @@ def render_patches(
       kpbench render-patches --board hexagon --diameter-mm 60 --tile
       kpbench render-patches --board grid --target opencv --target kalibr
       kpbench render-patches --board truth --pdf
+      kpbench render-patches --board field --rows 11 --columns 8 --diameter-mm 14
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, find_patch, load_boards
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.patches.reference_boards import with_reference
-    from kpbench.patches.symmetry import pose_problem
     from kpbench.printing.page_format import parse_page_format
     from kpbench.printing.prints import print_boards, print_patches
     from kpbench.printing.sidecar import correct_sidecars
@@ -130,7 +140,8 @@ def render_patches(
     patches = load_patches(designs) if designs else shipped_patches()
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
-    boards = load_boards(board, patches if designs or chosen else None, diameter_mm) if board is not None else ()
+    own = patches if designs or chosen else None
+    boards = load_boards(board, own, diameter_mm, rows=rows, columns=columns) if board is not None else ()
     if reference:
         boards = tuple(map(with_reference, boards))
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
@@ -143,10 +154,17 @@ def render_patches(
             files = print_patches(patches, out, diameter_mm=diameter_mm or DEFAULT_DIAMETER_MM, copies=copies, **layout)
     for path in files:
         echo(path)
-    for printed in boards:
-        if problem := pose_problem(printed):
-            print_warning(f"the pose of board {printed.name} is not unique: {problem}")
+    _warn_of_poses(boards)
     echo("Print at 100 % (no scaling), then measure both rulers on the paper.", err=True)
+
+
+def _warn_of_poses(boards: Sequence[Board]) -> None:
+    """Print a warning for each board whose pose is not unique."""
+    from kpbench.patches.symmetry import pose_problem
+
+    for board in boards:
+        if problem := pose_problem(board):
+            print_warning(f"the pose of board {board.name} is not unique: {problem}")
 
 
 def _check_usage(given: set[str], board: str | None) -> None:
@@ -161,5 +179,7 @@ def _check_usage(given: set[str], board: str | None) -> None:
         raise click.UsageError("--reference adds marks to a board; give --board.")
     if board is not None and "copies" in given:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
-    if board not in (None, "hexagon", "grid", "truth") and "chosen" in given:
+    if board != "field" and given & {"rows", "columns"}:
+        raise click.UsageError("--rows and --columns are the size of a --board field.")
+    if board not in (None, "hexagon", "grid", "truth", "field") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")

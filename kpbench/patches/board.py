@@ -19,7 +19,8 @@ from kpbench.geometry.homography import project
 from kpbench.geometry.outline import cos_sin_deg, flatten
 from kpbench.geometry.spread import spread
 from kpbench.patches.design import Patch, unit_polygons
-from kpbench.patches.reference import ReferenceMark
+from kpbench.patches.lattice import Lattice, find_lattice
+from kpbench.patches.reference import TOUCHING_MM, ReferenceMark, check_references
 from kpbench.types import Float, Int
 
 # In the paper, a disc is 16 px wide if its board covers 0.5 % of a 1624 x 1240 px image. A square board then has a side
@@ -27,7 +28,6 @@ from kpbench.types import Float, Int
 HEXAGON_DIAMETER = 0.16  # disc diameter as a fraction of the side
 HEXAGON_CIRCUMRADIUS = 0.36  # distance of the discs' centres from the board's centre, as a fraction of the side
 SINGLE_DIAMETER = 0.92  # diameter of the one patch of a board, as a fraction of the side
-TOUCHING_MM = 1e-6  # a smaller overlap is accepted: after rounding, two touching patches may seem to overlap
 
 
 class BoardPoint(Protocol):
@@ -188,29 +188,8 @@ class Board:
         for k in self.keypoints:
             if seen.setdefault(k.patch.patch_id, k.patch).digest != k.patch.digest:
                 raise DesignError(f"board {self.name!r}: two designs share the id {k.patch.patch_id}")
-        if self.references:
-            self._check_references(np.stack([x, y], axis=1), extent)
-
-    def _check_references(self, centres: Float, extent: Float) -> None:
-        place = np.array([(m.x_mm, m.y_mm) for m in self.references])
-        half = np.array([(m.width_mm, m.height_mm) for m in self.references]) / 2
-        ids = [m.mark_id for m in self.references]
-        if len({m.dictionary for m in self.references}) > 1 or len({*ids}) < len(ids):
-            raise DesignError(f"board {self.name!r}: reference marks need one dictionary and different ids")
-        side = np.array([self.side_x_mm, self.side_y_mm]) / 2
-        between = np.abs(place[:, None] - place) - half[:, None] - half
-        overlap = (between < -TOUCHING_MM).all(axis=2) & ~np.eye(len(ids), dtype=bool)
-        to_patch = (
-            np.hypot(*np.maximum(np.abs(place[:, None] - centres) - half[:, None], 0).transpose(2, 0, 1)) - extent
-        )
-        bad = (np.abs(place) + half > side + TOUCHING_MM).any(axis=1) | overlap.any(axis=1)
-        bad |= (to_patch < -TOUCHING_MM).any(axis=1)
-        if bad.any():
-            mark = self.references[int(np.argmax(bad))]
-            raise DesignError(
-                f"board {self.name!r}: reference mark {mark.mark_id} at ({mark.x_mm:g}, {mark.y_mm:g}) mm overlaps "
-                "a patch, another mark or the edge of the board"
-            )
+        side = np.array([self.side_x_mm, self.side_y_mm])
+        check_references(self.name, self.references, side, np.stack([x, y], axis=1), extent)
 
     @property
     def patches(self) -> tuple[Patch, ...]:
@@ -226,6 +205,13 @@ class Board:
     def A_patch2board(self) -> Float:
         """Linear map from the disc of each keypoint to mm of the board frame, ndarray of shape (N, 2, 2)."""
         return np.stack([k.H_patch2board[:2, :2] for k in self.keypoints])
+
+    @cached_property
+    def lattice(self) -> Lattice | None:
+        """Rows and columns of the patches if the board is a field, see :func:`kpbench.field_board`; None otherwise."""
+        rows = np.array([(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints])
+        ids = np.array([k.patch_id for k in self.keypoints])
+        return find_lattice(rows[:, :2], ids, rows[:, 2], rows[:, 3])
 
     @cached_property
     def orientations(self) -> tuple[Int, Float, Float]:

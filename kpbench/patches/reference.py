@@ -21,6 +21,8 @@ from kpbench.geometry.outline import Line, Region, flatten
 from kpbench.patches.modules import Modules, module_region
 from kpbench.types import Float
 
+TOUCHING_MM = 1e-6
+"""A smaller overlap is accepted: after rounding, two touching patches may seem to overlap."""
 TAG_MODULES, SQUARE_SIDE, ARM_MODULES = 6, 10, 3
 """Sides of the tag and of the white square, and width of an arm, in modules."""
 MARK_MODULES = SQUARE_SIDE + 2 * ARM_MODULES
@@ -101,6 +103,34 @@ class ReferenceMark:
     def _place(self, points: Float, modules: int) -> Float:
         size = np.array([self.width_mm, self.height_mm]) / MARK_MODULES
         return np.asarray((points - modules / 2) * size + (self.x_mm, self.y_mm))
+
+
+def check_references(
+    board: str, references: Sequence[ReferenceMark], side_mm: Float, centres_mm: Float, extent_mm: Float
+) -> None:
+    """Refuse reference marks that overlap a patch, another mark or the edge of their board, or are no set.
+
+    ``side_mm`` (2,) is the size of the board. ``centres_mm`` (N, 2) and ``extent_mm`` (N,) are those of the patches.
+    """
+    if not references:
+        return
+    place = np.array([(m.x_mm, m.y_mm) for m in references])
+    half = np.array([(m.width_mm, m.height_mm) for m in references]) / 2
+    ids = [m.mark_id for m in references]
+    if len({m.dictionary for m in references}) > 1 or len({*ids}) < len(ids):
+        raise DesignError(f"board {board!r}: reference marks need one dictionary and different ids")
+    between = np.abs(place[:, None] - place) - half[:, None] - half
+    overlap = (between < -TOUCHING_MM).all(axis=2) & ~np.eye(len(ids), dtype=bool)
+    apart = np.maximum(np.abs(place[:, None] - centres_mm) - half[:, None], 0)
+    to_patch = np.hypot(*apart.transpose(2, 0, 1)) - extent_mm
+    bad = (np.abs(place) + half > side_mm / 2 + TOUCHING_MM).any(axis=1) | overlap.any(axis=1)
+    bad |= (to_patch < -TOUCHING_MM).any(axis=1)
+    if bad.any():
+        mark = references[int(np.argmax(bad))]
+        raise DesignError(
+            f"board {board!r}: reference mark {mark.mark_id} at ({mark.x_mm:g}, {mark.y_mm:g}) mm overlaps "
+            "a patch, another mark or the edge of the board"
+        )
 
 
 def reference_dictionary(name: str) -> cv2.aruco.Dictionary:

@@ -122,7 +122,7 @@ def test_no_sidecar_at_all_is_one_line(here):
             load_board("bad.json")
     with pytest.raises(DesignError, match="sets all diameters"):
         load_board("bad.json", diameter_mm=3.0)
-    with pytest.raises(DesignError, match="none: no such file, expected hexagon, grid, truth or a board's file"):
+    with pytest.raises(DesignError, match="none: no such file, expected hexagon, grid, truth, field or a board's file"):
         load_boards("none")
 
 

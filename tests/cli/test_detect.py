@@ -493,7 +493,11 @@ def test_boards_go_into_the_stream(film):
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (("--board", "none.toml"), 1, "none.toml: no such file, expected hexagon, grid, truth or a board's file"),
+        (
+            ("--board", "none.toml"),
+            1,
+            "none.toml: no such file, expected hexagon, grid, truth, field or a board's file",
+        ),
         (("--board", "camera.yaml"), 1, "camera.yaml: not valid TOML"),
         (("--board", "square.toml", "--camera", "square.toml"), 1, "square.toml: no calibration file"),
         (("--board", "square.toml", "--camera", "small.yaml"), 1, "photos/0.png: the image has 640x480 px, expected"),

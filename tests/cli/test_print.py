@@ -101,7 +101,7 @@ def test_measured_corrects_what_was_printed_and_renders_nothing():
         (("--page", "b5"), "--page is 'b5', expected a4"),
         (("--patch", "nobody"), "patch 'nobody' is not known; known are: "),
         (("--board", "hexagon", "--diameter-mm", 40), "the largest diameter that fits"),
-        (("--board", "octagon"), "octagon: no such file, expected hexagon, grid, truth or"),
+        (("--board", "octagon"), "octagon: no such file, expected hexagon, grid, truth, field or"),
         (("--design", "none.toml"), r"none\.toml: cannot be read"),
         (("--measured", "100,100"), "patches-print: no sidecar"),
         (("--png", "--page", "5000x5000mm", "--dpi", 4800), "too large for a PNG"),
