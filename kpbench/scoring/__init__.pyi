@@ -10,6 +10,7 @@ from .breakpoints import Breakpoint as Breakpoint
 from .breakpoints import find_breakpoints as find_breakpoints
 from .comparison import Comparison as Comparison
 from .comparison import Difference as Difference
+from .comparison import check_no_worse as check_no_worse
 from .comparison import check_regression as check_regression
 from .comparison import compare as compare
 from .groups import Group as Group
@@ -26,6 +27,8 @@ from .scores import Scores as Scores
 from .scores import check_gates as check_gates
 from .scores import compute_scores as compute_scores
 from .scores import score as score
+from .significance import adjust_holm as adjust_holm
+from .significance import exchange_test as exchange_test
 from .tracks import TRACK_METRICS as TRACK_METRICS
 from .tracks import FilmTruth as FilmTruth
 from .tracks import PoseSeries as PoseSeries

@@ -49,3 +49,11 @@ def test_predictions_of_other_images_do_not_fit(here):
     (here / "poor.csv").write_text("\n".join(",".join(row) for row in rows[1:-2]))
     refused = kpbench("compare", "good.json", "poor.csv", code=1)
     assert "poor.csv does not fit kpbench-data" in refused.stderr
+
+
+def test_no_worse_must_be_shown(here):
+    kpbench("compare", "good.json", "poor.csv", "--no-worse", "detection_score=0.01", "--json", "c.json")
+    first = json.loads((here / "c.json").read_text())["comparisons"][0]["differences"][0]
+    assert (first["p"], first["p_holm"]) == (2 / 2**4, None)  # 4 of 12 scenes differ
+    refused = kpbench("compare", "poor.csv", "good.json", "--no-worse", "detection_score=0.01", code=1).stderr
+    assert refused.startswith("kpbench: detection score of d poor.csv may be worse than that of d good.json by more")
