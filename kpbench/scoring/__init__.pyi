@@ -23,6 +23,8 @@ from .metrics import compute_ratios as compute_ratios
 from .outcomes import Outcomes as Outcomes
 from .outcomes import Settings as Settings
 from .outcomes import match_predictions as match_predictions
+from .planning import ScenePlan as ScenePlan
+from .planning import plan_scenes as plan_scenes
 from .scores import Scores as Scores
 from .scores import check_gates as check_gates
 from .scores import compute_scores as compute_scores
