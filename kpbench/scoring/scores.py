@@ -27,6 +27,7 @@ from kpbench.scoring.assignment import MATCHED, count_matches
 from kpbench.scoring.groups import Group, GroupKey, make_groups
 from kpbench.scoring.metrics import count_above_thresholds
 from kpbench.scoring.outcomes import Outcomes, Settings, match_predictions
+from kpbench.scoring.reliability import compute_reliability
 from kpbench.scoring.uncertainty import compute_nees_by_sigma
 from kpbench.types import Detections, Predictions, Truth
 
@@ -130,6 +131,11 @@ class Scores:
         """
         return compute_nees_by_sigma(self.outcomes)
 
+    @cached_property
+    def reliability(self) -> dict[str, Any]:
+        """The calibration of the score over all images: :func:`kpbench.scoring.reliability.compute_reliability`."""
+        return compute_reliability(self.outcomes.detections.score, self.outcomes.matches.kind == MATCHED)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return a flat table: a row over all images, then a row per group.
 
@@ -173,6 +179,7 @@ class Scores:
             "curve": self.curve,
             "eps_curve": self.eps_curve,
             "nees_by_sigma": self.nees_by_sigma,
+            "reliability": self.reliability,
         }
 
 
