@@ -19,6 +19,7 @@ from kpbench.report.report import Report, require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
     encode_comparisons,
+    encode_images_csv,
     encode_scores,
     encode_scores_csv,
 )
@@ -110,6 +111,7 @@ def score_file(
     pose: bool = False,
     json_file: str | Path | None = None,
     csv_file: str | Path | None = None,
+    images_csv_file: str | Path | None = None,
     report_file: str | Path | None = None,
     command: Sequence[str] = (),
     warn: Callable[[str], None] = warnings.warn,
@@ -126,8 +128,9 @@ def score_file(
         predictions name, else the folder ``kpbench-data``.
     pose : bool
         Whether to compute errors of the board's pose also. The dataset must be made from a suite.
-    json_file, csv_file, report_file : str, Path or None
-        Files to write: all scores as JSON, one row per group as CSV, and a report (.html, .md or .tex).
+    json_file, csv_file, images_csv_file, report_file : str, Path or None
+        Files to write: all scores as JSON, one row per group as CSV, one row per image as CSV, and a report (.html, .md
+        or .tex).
     command : sequence of str
         The command line, for the provenance.
     warn : function
@@ -154,8 +157,9 @@ def score_file(
     >>> scored.scores["precision"], scored.dataset.path.name
     (1.0, 'kpbench-data')
     """
-    path, (to_json, to_csv, to_report) = Path(predictions), map(_as_path, (json_file, csv_file, report_file))
-    _refuse_overwrite([path], {"scores": to_json, "table": to_csv, "report": to_report})
+    path, to_json, to_report = Path(predictions), _as_path(json_file), _as_path(report_file)
+    to_csv, to_images = _as_path(csv_file), _as_path(images_csv_file)
+    _refuse_overwrite([path], {"scores": to_json, "table": to_csv, "images": to_images, "report": to_report})
     dataset, [scores] = _score_files([path], truth, warn, options)
     poses = _compute_poses(scores, dataset) if pose else ()
     provenance = collect_provenance(dataset, [path], command)
@@ -163,6 +167,8 @@ def score_file(
         write_file(to_json, encode_scores(scores, provenance, poses))
     if to_csv:
         write_file(to_csv, encode_scores_csv(scores, provenance))
+    if to_images:
+        write_file(to_images, encode_images_csv(scores))
     if to_report:
         _write_report(to_report, [scores], dataset, provenance, warn, poses=poses)
     return ScoredFile(scores, dataset, poses, provenance)

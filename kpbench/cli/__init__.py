@@ -37,6 +37,7 @@ COMMANDS = {
     "label": ("label:label", "Make a labelled dataset from photographs of a board."),
     "score": ("score:score", "Score a predictions file with the paper's metrics."),
     "compare": ("compare:compare", "Compare detectors on the same images, pair by pair."),
+    "plan": ("plan:plan", "Say how many scenes a measurement needs."),
     "bench": ("benchmark:bench", "Make suites, run and score detectors, compare with the paper."),
     "train": ("train:train", "Train the detector, or its verifier; needs kpbench[train]."),
     "export-model": ("train:export_model", "Write trained weights as an ONNX file."),

@@ -99,6 +99,7 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
 @scoring_options
 @click.option("--json", "json_file", type=FILE, help="Write all scores.")
 @click.option("--csv", "csv_file", type=FILE, help="Write one row per condition, rung and patch.")
+@click.option("--images-csv", "images_csv_file", type=FILE, help="Write one row per image, such as for pandas.")
 @click.option(
     "--pose", is_flag=True, help="Also compute errors of the board's pose. The dataset must be made by kpbench suite."
 )

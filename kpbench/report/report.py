@@ -36,6 +36,7 @@ from kpbench.report.score_tables import (
     nees_table,
     overview_table,
     paper_table,
+    reliability_table,
     synthetic_table,
     verdict_table,
 )
@@ -179,10 +180,11 @@ def _severity_section(report: Report) -> Section:
 
 
 def _precision_recall_section(report: Report) -> Section:
+    calibration = (reliability_table(run) for run in report.runs if run.reliability["bins"])
     return Section(
         "Precision and recall",
         "Precision and recall at every score threshold; detection score against the matching threshold.",
-        (precision_recall_chart(report.runs), eps_chart(report.runs)),
+        (precision_recall_chart(report.runs), eps_chart(report.runs), *calibration),
     )
 
 

@@ -96,7 +96,16 @@ def encode_scores_csv(scores: Scores, provenance: Mapping[str, Any]) -> bytes:
         "source": provenance.get("dataset", {}).get("source") or "",
         "kpbench": provenance["kpbench"],
     }
-    rows = [{name: escape_csv(value) for name, value in (about | row).items()} for row in scores.rows()]
+    return _encode_rows([about | row for row in scores.rows()])
+
+
+def encode_images_csv(scores: Scores) -> bytes:
+    """Encode the counts of each image as CSV, one row per image."""
+    return _encode_rows([{"detector": scores.name} | row for row in scores.image_rows()])
+
+
+def _encode_rows(table: Sequence[Mapping[str, Any]]) -> bytes:
+    rows = [{name: escape_csv(value) for name, value in row.items()} for row in table]
     text = io.StringIO()
     writer = csv.DictWriter(text, rows[0], lineterminator="\n")
     writer.writeheader()

@@ -268,6 +268,17 @@ def nees_table(run: Scores) -> Table:
     return Table(f"NEES by predicted sigma: {run.name}", ("predicted sigma (px)", "matched", LABELS["nees"]), rows)
 
 
+def reliability_table(run: Scores) -> Table:
+    """Tabulate the reliability curve of the scores of detections, one row per bin of scores."""
+    rows = tuple(
+        (f"{low:.1f} to {high:.1f}", part["detections"], part["score_mean"], part["precision"])
+        for part in run.reliability["bins"]
+        for low, high in [part["score"]]
+    )
+    title = f"Calibration of the score: {run.name}, ECE {run.reliability['ece']:.3f}"
+    return Table(title, ("score", "detections", "mean score", "precision"), rows)
+
+
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:
     """Tabulate differences over all images, and verdicts counted over rungs: a row per other detector and metric.
 

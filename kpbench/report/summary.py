@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kpbench.report.score_tables import difference_table, group_table, nees_table, pose_table, verdict_table
+from kpbench.report.score_tables import (
+    difference_table,
+    group_table,
+    nees_table,
+    pose_table,
+    reliability_table,
+    verdict_table,
+)
 from kpbench.report.tables import Estimate, Table, cell_text, to_plain
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.comparison import Comparison
@@ -55,6 +62,8 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
         lines.append(to_plain(Table("", ("", *ids, "other"), matrix)))
     if scores.nees_by_sigma:
         lines += ["", _with_title(nees_table(scores))]
+    if scores.reliability["bins"]:
+        lines += ["", _with_title(reliability_table(scores))]
     if scores.by:
         errors = ["error_median_px", *(m for m in ("bias_px", "nees") if overall.metrics[m] is not None)]
         lines += ["", to_plain(group_table(scores.by, "", errors=errors), 4)]

@@ -10,6 +10,7 @@ from .breakpoints import Breakpoint as Breakpoint
 from .breakpoints import find_breakpoints as find_breakpoints
 from .comparison import Comparison as Comparison
 from .comparison import Difference as Difference
+from .comparison import check_no_worse as check_no_worse
 from .comparison import check_regression as check_regression
 from .comparison import compare as compare
 from .groups import Group as Group
@@ -22,10 +23,14 @@ from .metrics import compute_ratios as compute_ratios
 from .outcomes import Outcomes as Outcomes
 from .outcomes import Settings as Settings
 from .outcomes import match_predictions as match_predictions
+from .planning import ScenePlan as ScenePlan
+from .planning import plan_scenes as plan_scenes
 from .scores import Scores as Scores
 from .scores import check_gates as check_gates
 from .scores import compute_scores as compute_scores
 from .scores import score as score
+from .significance import adjust_holm as adjust_holm
+from .significance import exchange_test as exchange_test
 from .tracks import TRACK_METRICS as TRACK_METRICS
 from .tracks import FilmTruth as FilmTruth
 from .tracks import PoseSeries as PoseSeries

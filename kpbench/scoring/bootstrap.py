@@ -89,12 +89,8 @@ def bootstrap_intervals(
     """
     if len(sums) < 2 or not resamples:
         return dict.fromkeys(statistics(sums.sum(axis=0)))
-    kinds, count = _unique_rows(sums)
     rng = np.random.default_rng(seed)
-    if len(kinds) > MOST_KINDS:  # sums of random pools of about equal size vary like sums of scenes
-        shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
-        kinds = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
-        count = np.ones(MOST_KINDS, np.int64)
+    kinds, count = pool_kinds(sums, rng)
     drawn = rng.multinomial(count.sum(), count / count.sum(), size=resamples)
     total = count @ kinds
     found, without_one = statistics(total), statistics(total - kinds)
@@ -105,6 +101,20 @@ def bootstrap_intervals(
         low, high = np.quantile(values, levels).tolist() if len(values) else (np.nan, np.nan)
         result[name] = (low, high) if len(values) else None
     return result
+
+
+def pool_kinds(sums: NDArray[Any], rng: np.random.Generator) -> tuple[NDArray[Any], Int]:
+    """Return the kinds of scenes, of shape (K, M), and the number of scenes of each kind, of shape (K,).
+
+    More than ``MOST_KINDS`` kinds are replaced by random pools of about equal size. Sums of pools vary like sums of
+    scenes.
+    """
+    kinds, count = _unique_rows(sums)
+    if len(kinds) <= MOST_KINDS:
+        return kinds, count
+    shuffled = np.repeat(kinds, count, axis=0)[rng.permutation(len(sums))]
+    pools = np.add.reduceat(shuffled, np.linspace(0, len(sums), MOST_KINDS, endpoint=False).astype(int))
+    return pools, np.ones(MOST_KINDS, np.int64)
 
 
 def _percentile_levels(values: Float, found: float, without_one: Float, count: Int, scenes: int) -> Float:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from kpbench.errors import DataError, GateFailed
 from kpbench.scoring.bootstrap import Interval, bootstrap_intervals, sum_by_scene
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS, SUMS, compute_ratios
 from kpbench.scoring.scores import Scores
+from kpbench.scoring.significance import LEVEL, adjust_holm, exchange_test
 from kpbench.types import Float
 
 COMPARED_METRICS = (*PAPER_METRICS, "precision", "f1")
@@ -38,6 +39,10 @@ class Difference:
     interval : (low, high) or None
         95 % interval of ``first`` minus ``second``. Each resample draws the same scenes for both detectors. None for
         fewer than two scenes, if `resamples` is 0, or if a metric is undefined.
+    p : float or None
+        Two-sided p-value of :func:`kpbench.scoring.exchange_test`. None where ``interval`` is None.
+    p_holm : float or None
+        The p-value adjusted for all rungs of the metric by :func:`kpbench.scoring.adjust_holm`. None over all images.
 
     Examples
     --------
@@ -45,6 +50,8 @@ class Difference:
     >>> difference = kpbench.scoring.Difference("blur", 7, "detection_score", 0.75, 0.5, (0.1, 0.4))
     >>> difference.value, difference.verdict
     (0.25, 'better')
+    >>> difference.is_no_worse(0.01)
+    True
     """
 
     condition: str | None
@@ -53,6 +60,8 @@ class Difference:
     first: float | None
     second: float | None
     interval: Interval | None
+    p: float | None = None
+    p_holm: float | None = None
 
     @property
     def value(self) -> float | None:
@@ -61,10 +70,29 @@ class Difference:
 
     @property
     def verdict(self) -> str:
-        """Verdict on the first detector: "better", "worse" or "even" (the interval contains 0 or is None)."""
+        """Verdict on the first detector: "better", "worse" or "even".
+
+        "even" if the interval contains 0 or is None, or if ``p_holm`` is over 0.05.
+        """
         if self.value is None or self.interval is None or self.interval[0] <= 0 <= self.interval[1]:
             return "even"
+        if self.p_holm is not None and self.p_holm > LEVEL:
+            return "even"
         return "better" if (self.value > 0) != (self.metric in LOWER_IS_BETTER) else "worse"
+
+    def is_no_worse(self, margin: float) -> bool:
+        """Return whether the interval excludes that the first detector is worse by more than ``margin``.
+
+        The error probability is 2.5 %, because one end of the 95 % interval decides.
+        """
+        if self.interval is None:
+            return False
+        low, high = self.interval
+        return high <= margin if self.metric in LOWER_IS_BETTER else low >= -margin
+
+    def is_equivalent(self, margin: float) -> bool:
+        """Return whether the interval lies between ``-margin`` and ``margin``."""
+        return self.interval is not None and -margin <= self.interval[0] and self.interval[1] <= margin
 
     def to_dict(self) -> dict[str, Any]:
         """Return an entry of ``differences`` in the comparison file."""
@@ -132,6 +160,12 @@ def compare(first: Scores, second: Scores) -> Comparison:
     >>> kpbench.compare(scores, scores).differences[0].value
     0.0
     """
+    require_same_truth(first, second)
+    return Comparison(first.name, second.name, _adjust(list(_compute_differences(first, second))))
+
+
+def require_same_truth(first: Scores, second: Scores) -> None:
+    """Raise a :class:`kpbench.DataError` if the truth or the settings of two scores differ."""
     a, b = first.outcomes, second.outcomes
     same = a.truth is b.truth or (
         a.truth.fingerprint == b.truth.fingerprint
@@ -140,7 +174,16 @@ def compare(first: Scores, second: Scores) -> Comparison:
     )
     if not same or a.settings != b.settings:
         raise DataError(f"{first.name} and {second.name} were not scored on the same images with the same settings")
-    return Comparison(first.name, second.name, tuple(_compute_differences(first, second)))
+
+
+def _adjust(differences: Sequence[Difference]) -> tuple[Difference, ...]:
+    """Set ``p_holm`` of the rungs of each metric."""
+    result = list(differences)
+    for metric in COMPARED_METRICS:
+        p = {n: d.p for n, d in enumerate(result) if d.metric == metric and d.condition is not None and d.p is not None}
+        for n, adjusted in zip(p, adjust_holm(list(p.values())).tolist(), strict=True):
+            result[n] = replace(result[n], p_holm=adjusted)
+    return tuple(result)
 
 
 def _compute_differences(first: Scores, second: Scores) -> Iterator[Difference]:
@@ -161,10 +204,12 @@ def _compute_differences(first: Scores, second: Scores) -> Iterator[Difference]:
         rows = np.ones(len(truth), bool) if condition is None else (truth.condition == condition) & (truth.rung == rung)
         scenes = sum_by_scene(both[rows], truth.scene_id[rows])
         intervals = bootstrap_intervals(scenes, difference, settings.resamples, settings.seed)
+        p = exchange_test(scenes, difference, settings.seed) if settings.resamples else dict.fromkeys(COMPARED_METRICS)
         one, other = ratios_of_both(scenes.sum(axis=0))
         for name in COMPARED_METRICS:
             a, b = (None if name in undefined or np.isnan(v[name]) else float(v[name]) for v in (one, other))
-            yield Difference(condition, rung, name, a, b, None if a is None or b is None else intervals[name])
+            interval = None if a is None or b is None else intervals[name]
+            yield Difference(condition, rung, name, a, b, interval, None if interval is None else p[name])
 
 
 def check_regression(comparisons: Sequence[Comparison]) -> None:
@@ -196,6 +241,46 @@ def check_regression(comparisons: Sequence[Comparison]) -> None:
                 failed.append(
                     f"{LABELS[d.metric]} of {c.first} is worse than that of {c.second} by {d.value:+.4f} "
                     f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
+                )
+    if failed:
+        raise GateFailed("; ".join(failed))
+
+
+def check_no_worse(comparisons: Sequence[Comparison], margins: Mapping[str, float]) -> None:
+    """Raise an error unless the first detector is no worse than the others by more than a margin, over all images.
+
+    Parameters
+    ----------
+    comparisons : sequence of Comparison
+    margins : mapping of str to float
+        The margin of each metric to check, in the unit of the metric.
+
+    Raises
+    ------
+    GateFailed
+        If an interval does not exclude a larger loss, or if there is no interval.
+    DataError
+        If a metric is not compared, or a margin is not positive.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.scoring.check_no_worse([kpbench.compare(scores, scores)], {"detection_score": 0.01})
+    """
+    failed = []
+    for metric, margin in margins.items():
+        if metric not in COMPARED_METRICS:
+            raise DataError(f"{metric} is not compared, only {', '.join(COMPARED_METRICS)}")
+        if not margin > 0:
+            raise DataError(f"the margin of {metric} is {margin:g}, expected a positive number")
+        for c in comparisons:
+            d = next(d for d in c.differences if d.condition is None and d.metric == metric)
+            if not d.is_no_worse(margin):
+                shown = "no interval" if d.interval is None else f"[{d.interval[0]:+.4f}, {d.interval[1]:+.4f}]"
+                failed.append(
+                    f"{LABELS[metric]} of {c.first} may be worse than that of {c.second} by more than {margin:g}: "
+                    f"{shown}"
                 )
     if failed:
         raise GateFailed("; ".join(failed))

@@ -232,7 +232,7 @@ def make_groups(outcomes: Outcomes) -> Iterator[Group]:
     conditions, condition = np.unique(truth.condition, return_inverse=True)
     rungs, rung = np.unique(truth.rung, return_inverse=True)
     codes, code = _number(condition * len(rungs) + rung)
-    keys = [GroupKey(str(conditions[c // len(rungs)]) or None, _as_written(rungs[c % len(rungs)])) for c in codes]
+    keys = [GroupKey(str(conditions[c // len(rungs)]) or None, as_written(rungs[c % len(rungs)])) for c in codes]
     has_conditions = keys != [GroupKey()]
     if has_conditions:  # images without condition and rung would have the key of all images
         yield from (group for group in images.group(keys, code) if group.key != GroupKey())
@@ -309,7 +309,7 @@ def _rows_of_labels(label: NDArray[Any], labels: int) -> list[Int]:
     return [order[a:b] for a, b in pairwise(edges.tolist())]
 
 
-def _as_written(rung: float) -> float | None:
+def as_written(rung: float) -> float | None:
     """Return a rung as suites write it: 15 rather than 15.0; None for nan."""
     if np.isnan(rung):
         return None

@@ -24,9 +24,10 @@ import numpy as np
 
 from kpbench.errors import GateFailed, PredictionsError
 from kpbench.scoring.assignment import MATCHED, count_matches
-from kpbench.scoring.groups import Group, GroupKey, make_groups
-from kpbench.scoring.metrics import count_above_thresholds
+from kpbench.scoring.groups import Group, GroupKey, as_written, make_groups
+from kpbench.scoring.metrics import SUMS, count_above_thresholds
 from kpbench.scoring.outcomes import Outcomes, Settings, match_predictions
+from kpbench.scoring.reliability import compute_reliability
 from kpbench.scoring.uncertainty import compute_nees_by_sigma
 from kpbench.types import Detections, Predictions, Truth
 
@@ -130,6 +131,11 @@ class Scores:
         """
         return compute_nees_by_sigma(self.outcomes)
 
+    @cached_property
+    def reliability(self) -> dict[str, Any]:
+        """The calibration of the score over all images: :func:`kpbench.scoring.reliability.compute_reliability`."""
+        return compute_reliability(self.outcomes.detections.score, self.outcomes.matches.kind == MATCHED)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return a flat table: a row over all images, then a row per group.
 
@@ -146,6 +152,22 @@ class Scores:
                 for k, end in enumerate(("low", "high"))
             }
             for g in (self.overall, *self.by)
+        ]
+
+    def image_rows(self) -> list[dict[str, Any]]:
+        """Return a table for pandas: a row per image, with its condition, rung, scene and counts."""
+        truth = self.outcomes.truth
+        return [
+            {"image_id": image_id, "scene_id": scene_id, "condition": condition or None, "rung": as_written(rung)}
+            | dict(zip(SUMS[1:], counts[1:], strict=True))
+            for image_id, scene_id, condition, rung, counts in zip(
+                truth.image_id.tolist(),
+                truth.scene_id.tolist(),
+                truth.condition.tolist(),
+                truth.rung.tolist(),
+                self.outcomes.image_sums.tolist(),
+                strict=True,
+            )
         ]
 
     @property
@@ -173,6 +195,7 @@ class Scores:
             "curve": self.curve,
             "eps_curve": self.eps_curve,
             "nees_by_sigma": self.nees_by_sigma,
+            "reliability": self.reliability,
         }
 
 

@@ -49,3 +49,21 @@ def test_predictions_of_other_images_do_not_fit(here):
     (here / "poor.csv").write_text("\n".join(",".join(row) for row in rows[1:-2]))
     refused = kpbench("compare", "good.json", "poor.csv", code=1)
     assert "poor.csv does not fit kpbench-data" in refused.stderr
+
+
+def test_no_worse_must_be_shown(here):
+    kpbench("compare", "good.json", "poor.csv", "--no-worse", "detection_score=0.01", "--json", "c.json")
+    first = json.loads((here / "c.json").read_text())["comparisons"][0]["differences"][0]
+    assert (first["p"], first["p_holm"]) == (2 / 2**4, None)  # 4 of 12 scenes differ
+    refused = kpbench("compare", "poor.csv", "good.json", "--no-worse", "detection_score=0.01", code=1).stderr
+    assert refused.startswith("kpbench: detection score of d poor.csv may be worse than that of d good.json by more")
+
+
+def test_the_table_of_images_adds_up(here):
+    kpbench("score", "poor.csv", "--images-csv", "images.csv", "--json", "s.json")
+    rows = list(csv.DictReader((here / "images.csv").read_text().splitlines()))
+    counts = json.loads((here / "s.json").read_text())["metrics"]["counts"]
+    assert len(rows) == 12
+    assert [row["matched"] for row in rows[:2]] == ["0", "2"]
+    for name in ("truths", "detections", "matched", "duplicate"):
+        assert sum(int(row[name]) for row in rows) == counts[name]
