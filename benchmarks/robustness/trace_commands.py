@@ -55,6 +55,7 @@ detect set --detector mine:find --out mine.json
 score small.csv --gt set --json scores.json --csv scores.csv --report report.html
 score small.csv --gt coco/annotations.json --report report.md
 score small.csv --gt set --report report.tex
+plan --pilot small.csv --gt set --margin 0.1 --json plan.json
 compare small.csv template.json --gt set --json compared.json --report compared.html
 bench --suite paper-v1 --images 1 --size 203x155 --only blur --detector orb --detector aruco --out bench
 suite video-v1 --images 1 --frames 3 --size 406x310 --only speed --out films
