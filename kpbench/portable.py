@@ -72,6 +72,24 @@ def cos_sin(angle_rad: ArrayLike) -> tuple[Float, Float]:
     return np.where((nth == 1) | (nth == 2), -c, c), np.where(nth >= 2, -s, s)
 
 
+def cos_sin_of(angle_rad: float) -> tuple[float, float]:
+    """Return the cosine and the sine of one angle: the bits of :func:`cos_sin`, in a tenth of the time.
+
+    Examples
+    --------
+    >>> from kpbench.portable import cos_sin_of
+    >>> cos_sin_of(0.0)
+    (1.0, 0.0)
+    """
+    x = float(angle_rad)
+    quarter = round(x * (2 / math.pi))
+    rest = ((x - quarter * _HALF_PI[0]) - quarter * _HALF_PI[1]) - quarter * _HALF_PI[2]
+    square = rest * rest
+    s, c = rest + rest * _polynomial(_SIN, square), 1 + _polynomial(_COS, square)
+    cosine, sine = ((c, s), (-s, c), (-c, -s), (s, -c))[quarter & 3]
+    return cosine, sine
+
+
 def exp(x: ArrayLike) -> Float:
     """Return e to the power of x, for x from -700 to 700.
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from kpbench.geometry.outline import Region, cos_sin_deg
 from kpbench.geometry.spread import spread
-from kpbench.portable import cos_sin
+from kpbench.portable import cos_sin, cos_sin_of
 from kpbench.types import Float
 
 LARGEST_TURN = math.pi / 2
@@ -82,7 +82,7 @@ class Cylinder:
         low, high = 0.0, LARGEST_TURN
         for _ in range(60):  # (1 - cos h) / h grows with the turn h of half of the sheet
             half = (low + high) / 2
-            sine = float(cos_sin(half / 2)[1])
+            sine = cos_sin_of(half / 2)[1]
             low, high = (half, high) if 2 * sine * sine < ratio * half else (low, half)
         return cls(math.copysign(width_mm / 2 / high, sagitta_mm), axis_deg)
 

@@ -14,7 +14,7 @@ from kpbench.errors import DataError
 from kpbench.files import find_shipped, shipped_files
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.camera_file import CALIBRATION_SUFFIXES, read_camera
-from kpbench.portable import cos_sin
+from kpbench.portable import cos_sin_of
 from kpbench.toml import TomlTable, name_source, read_toml
 
 CAMERA_SCHEMA = "kpbench.camera/1"
@@ -148,11 +148,11 @@ class CameraPreset:
         for name, (low, high) in self.spans:
             value = low + (high - low) * float(rng.random())
             drawn[name] = round(value) if name in WHOLE else round(value, 4)
-        c, s = (float(v) for v in cos_sin(2 * np.pi * float(rng.random())))
+        c, s = cos_sin_of(2 * np.pi * float(rng.random()))
         length = drawn.pop("motion_px")
         drawn["velocity_px"] = [round(length * c, 4), round(length * s, 4)]
         drawn["ink_gain"] = round(drawn["ink_gain"] / GAIN_STEP) * GAIN_STEP
-        z, (c, s) = float(rng.uniform(-1, 1)), (float(v) for v in cos_sin(2 * np.pi * float(rng.random())))
+        z, (c, s) = float(rng.uniform(-1, 1)), cos_sin_of(2 * np.pi * float(rng.random()))
         across, turn = float(np.sqrt(1 - z * z)), drawn["turn_deg"]
         drawn["turn_deg"] = [round(turn * v, 4) for v in (across * c, across * s, z)]
         drawn["axis_deg"] = round(180 * float(rng.random()), 2)

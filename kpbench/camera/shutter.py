@@ -181,7 +181,7 @@ class PatchMotion:
                     c, s = scale * c, scale * s
                 x, y = c * x - s * y, s * x + c * y
             vx, vy = self.velocity_px
-            moved = np.column_stack([centre[0] + x + vx * times, centre[1] + y + vy * times])
+            moved = np.array([centre[0] + x + vx * times, centre[1] + y + vy * times]).T
             return moved if warp is None else warp(moved)
 
         return move

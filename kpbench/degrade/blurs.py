@@ -12,7 +12,7 @@ import numpy as np
 from kpbench.filters import box_filter, filter_image, filter_separably, gaussian_taps
 from kpbench.geometry.coverage import rasterise
 from kpbench.geometry.outline import arc_vertices
-from kpbench.portable import cos_sin, matmul
+from kpbench.portable import cos_sin_of, matmul
 from kpbench.types import Float, UInt8
 
 
@@ -100,7 +100,7 @@ def motion_blur(image: UInt8, length_px: float, angle_deg: float) -> UInt8:
 @lru_cache(maxsize=2048)  # holds all kernels of the paper's mix; the ladder's kernels rarely repeat
 def line_kernel(length_px: float, angle_deg: float) -> Float:
     """Return the exact area coverage of a line, one pixel wide, through the kernel's centre, scaled to the sum 1."""
-    c, s = map(float, cos_sin(np.radians(angle_deg)))
+    c, s = cos_sin_of(np.radians(angle_deg))
     half_length, half_width = length_px / 2, 0.5
     corners = np.array([
         [half_length, half_width], [-half_length, half_width], [-half_length, -half_width], [half_length, -half_width],

@@ -18,7 +18,7 @@ import numpy as np
 
 from kpbench.geometry.coverage import Box, bounding_box, clip_to_image, rasterise
 from kpbench.images import encode_jpeg
-from kpbench.portable import cos_sin, exp, log, matmul, normal_quantiles
+from kpbench.portable import cos_sin_of, exp, log, matmul, normal_quantiles
 from kpbench.types import Float, UInt8
 
 Effect = dict[str, Any]
@@ -163,7 +163,7 @@ def shadow_edge(image: UInt8, x: float, y: float, angle_deg: float, light: float
     array([[200, 200, 200, 150, 100, 100, 100]], dtype=uint8)
     """
     dx, dy = _offsets_from(image, x, y)
-    c, s = (np.float32(v) for v in cos_sin(np.radians(angle_deg)))
+    c, s = (np.float32(v) for v in cos_sin_of(np.radians(angle_deg)))
     shaded = np.clip((dx * c + dy * s) / np.float32(penumbra_px) + np.float32(0.5), 0, 1)
     return to_uint8(image * for_all_channels(1 - np.float32(1 - light) * shaded, image))
 
@@ -249,7 +249,7 @@ def _strip_corners(strips: list[list[float]]) -> list[Float]:
     unit_square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     corners = []
     for x, y, length, width, angle_deg, _ in strips:
-        c, s = map(float, cos_sin(np.radians(angle_deg)))
+        c, s = cos_sin_of(np.radians(angle_deg))
         corners.append(matmul(unit_square * (length, width), np.array([[c, s], [-s, c]])) + np.array([x, y]))
     return corners
 

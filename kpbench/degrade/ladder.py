@@ -22,7 +22,7 @@ from kpbench.degrade.effects import (
 )
 from kpbench.degrade.weather import rain, rainfall, shadow
 from kpbench.errors import DataError
-from kpbench.portable import arctan2, cos_sin
+from kpbench.portable import arctan2, cos_sin_of
 from kpbench.types import Float, UInt8
 
 Discs = Float
@@ -106,7 +106,7 @@ def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, 
     strips = []
     for x, y, radius in discs:
         angle_deg, grey = _draw_angle_deg(rng, 360), float(rng.integers(20, 236))
-        c, s = cos_sin(np.radians(angle_deg))
+        c, s = cos_sin_of(np.radians(angle_deg))
         length, middle = (end - start) * radius, (end + start) / 2 * radius
         strip = (x + c * middle, y + s * middle, length, 2 * end * radius)
         strips.append([*(round(float(v), 3) for v in strip), angle_deg, grey])
@@ -116,7 +116,7 @@ def _draw_occlusion(rng: np.random.Generator, level: float, size_px: tuple[int, 
 def _draw_flare(rng: np.random.Generator, level: float, size_px: tuple[int, int], discs: Discs) -> Effect:
     """Draw a lamp, one to four radii from the centre of one of the patches."""
     x, y, radius = discs[int(rng.integers(len(discs)))]
-    (c, s), distance = cos_sin(rng.uniform(0, 2 * np.pi)), radius * rng.uniform(1, 4)
+    (c, s), distance = cos_sin_of(rng.uniform(0, 2 * np.pi)), radius * rng.uniform(1, 4)
     place = {"x": round(float(x + distance * c), 2), "y": round(float(y + distance * s), 2)}
     return {"effect": "flare", **place, "strength": level, "reach_px": round(0.15 * size_px[0], 2)}
 

@@ -88,7 +88,7 @@ class Lens:
         x, y = np.asarray(rays, np.float64).T
         if self.model == "fisheye":
             factor = self._fisheye(x, y)[0]
-            return np.column_stack([x * factor, y * factor])
+            return np.array([x * factor, y * factor]).T
         _, _, p1, p2, _, _, _, _, s1, s2, s3, s4 = self._all
         r2 = x * x + y * y
         radial = self._radial(r2)
@@ -96,7 +96,7 @@ class Lens:
         yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         if any((s1, s2, s3, s4)):
             xd, yd = xd + r2 * (s1 + r2 * s2), yd + r2 * (s3 + r2 * s4)
-        return np.column_stack([xd, yd])
+        return np.array([xd, yd]).T
 
     def jacobian(self, rays: ArrayLike) -> Float:
         """Return the derivatives of (x', y') by (x, y) at rays of shape (N, 2); ndarray of shape (N, 2, 2)."""

@@ -8,12 +8,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kpbench.portable import cos_sin
+from kpbench.portable import cos_sin, cos_sin_of
 from kpbench.types import Float
 
 
@@ -75,9 +76,9 @@ Region = tuple[Contour, ...]
 def cos_sin_deg(angle_deg: float) -> tuple[float, float]:
     """Return the cosine and sine of an angle. Both are exact at multiples of 90 degrees."""
     quarter, rest = divmod(angle_deg, 90.0)
-    c, s = cos_sin(np.radians(rest))
+    c, s = cos_sin_of(math.radians(rest))
     cosine, sine = ((c, s), (-s, c), (-c, -s), (s, -c))[int(quarter) % 4]
-    return float(cosine), float(sine)
+    return cosine, sine
 
 
 def circle(x: float, y: float, radius: float) -> Region:
@@ -195,7 +196,7 @@ def arc_vertices(radius: float, angles: ArrayLike, step: float) -> Float:
     -------
     ndarray of shape (N, 2)
     """
-    raised = float(radius * np.sqrt(step / cos_sin(step)[1]))
+    raised = radius * math.sqrt(step / cos_sin_of(step)[1])
     return np.asarray(raised * np.column_stack(cos_sin(angles)))
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from kpbench.camera.chain import SCENE_TONE
 from kpbench.geometry.coverage import bounding_box, clip_to_image
 from kpbench.geometry.homography import project
-from kpbench.portable import cos_sin
+from kpbench.portable import cos_sin, cos_sin_of
 from kpbench.types import Float, Float32, UInt8
 
 REACH = 1.15
@@ -94,7 +94,7 @@ def paint_detail(
     """
     names = list(kinds or DETAILS)
     drawn = sorted((names[int(rng.integers(len(names)))] for _ in range(count)), key=list(DETAILS).index)
-    c, s = cos_sin(2 * math.pi * float(rng.random()))
+    c, s = cos_sin_of(2 * math.pi * float(rng.random()))
     angles = np.arange(24) * (2 * np.pi / 24)
     rim = project(H_patch2image, REACH * np.column_stack(cos_sin(angles)))
     box = bounding_box([rim])
@@ -148,14 +148,14 @@ def _bump(square: Any) -> Any:
 
 def _turned(grid: Grid, u: float, v: float, rng: np.random.Generator) -> tuple[Float32, Float32]:
     """Return coordinates along and across a random direction, from a point."""
-    c, s = (float(value) for value in cos_sin(2 * math.pi * float(rng.random())))
+    c, s = cos_sin_of(2 * math.pi * float(rng.random()))
     x, y = grid.u - u, grid.v - v
     return x * c + y * s, y * c - x * s
 
 
 def _place(rng: np.random.Generator, radius: float) -> tuple[float, float]:
     """Draw a place, uniform in a disc about the centre."""
-    (c, s), distance = cos_sin(2 * math.pi * float(rng.random())), radius * math.sqrt(float(rng.random()))
+    (c, s), distance = cos_sin_of(2 * math.pi * float(rng.random())), radius * math.sqrt(float(rng.random()))
     return distance * float(c), distance * float(s)
 
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from kpbench.patches.design import Patch, unit_polygons
-from kpbench.portable import cos_sin, exp, log, matmul
+from kpbench.portable import cos_sin, cos_sin_of, exp, log, matmul
 from kpbench.types import Float, UInt8
 
 
@@ -136,7 +136,7 @@ def _draw_text(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> 
 
 def _draw_bar(image: UInt8, rng: np.random.Generator, lookalike: Lookalike) -> None:
     """Draw a bar or a line, six radii long."""
-    half = 3 * lookalike.radius * np.array(cos_sin(np.radians(lookalike.angle_deg)))
+    half = 3 * lookalike.radius * np.array(cos_sin_of(np.radians(lookalike.angle_deg)))
     start, end = ((round(lookalike.x + sign * half[0]), round(lookalike.y + sign * half[1])) for sign in (-1, 1))
     cv2.line(image, start, end, _colour(image, lookalike.ink), int(rng.integers(1, 8)), cv2.LINE_AA)
 
@@ -170,7 +170,7 @@ def _draw_half_patch(image: UInt8, rng: np.random.Generator, lookalike: Lookalik
 
 def _rotation(angle_deg: float) -> Float:
     """Return the matrix (2, 2) of a rotation from +x towards +y."""
-    c, s = map(float, cos_sin(np.radians(angle_deg)))
+    c, s = cos_sin_of(np.radians(angle_deg))
     return np.array([[c, -s], [s, c]])
 
 

@@ -12,7 +12,7 @@ from kpbench.degrade.effects import Effect
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera, rotation_xyz
 from kpbench.patches.board import BoardLike
-from kpbench.portable import cos_sin
+from kpbench.portable import cos_sin, cos_sin_of
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.toml import TomlTable
 from kpbench.types import Float
@@ -160,7 +160,7 @@ def draw_bar(
         return []
     side_px = camera.focal_px * max(board.side_x_mm, board.side_y_mm) / float(pose.t_camera[2])
     way = BAR_REACH * side_px * (2 * (frame - first + 0.5) / count - 1)
-    c, s = (float(v) for v in cos_sin(np.radians(angle)))
+    c, s = cos_sin_of(np.radians(angle))
     x, y = camera.project(pose.t_camera[None])[0].tolist()
     strip = (x + c * way, y + s * way, BAR_WIDTH * side_px, 3 * side_px, angle, grey)
     return [{"effect": "occlusion", "strips": [[round(v, 3) for v in strip]]}]
