@@ -53,7 +53,8 @@ def spread(region: Region, distance: float, within: float = math.inf) -> Region:
     parts = [part for contour in region for part in contour]
     if not parts or distance == 0:
         return region
-    extent = float(np.abs(np.concatenate(flatten(region, abs(distance) / 8))).max()) + abs(distance)
+    points = np.concatenate(flatten(region, abs(distance) / 8))
+    extent = float(np.sqrt((points * points).sum(axis=1).max())) + abs(distance)
     candidates = _candidates(parts, distance)
     cut: list[Segment] = [*circle(0.0, 0.0, within)[0]] if within < extent else []
     if not candidates:

@@ -66,6 +66,14 @@ def test_ink_of_any_design_spreads(parts, gain, is_cut):
         assert after[grown == 1].min(initial=1) > 0.99
 
 
+@pytest.mark.parametrize("angle_deg", [10.0, 45.0, 80.0, 190.0])
+def test_ink_that_touches_the_rim_beside_the_axes_is_cut(angle_deg):
+    """A narrow sector has no point with a coordinate of 1, yet its spread ink leaves the disc."""
+    patch = Patch("sector", 1, "white", tuple(SemiCircle(1.0, angle_deg + turn, "invert") for turn in (0.0, 5.0)))
+    points = np.concatenate(flatten(spread_ink(patch.black_region, 0.0067, 1.0), 1e-6))
+    assert np.hypot(*points.T).max() == pytest.approx(1.0, abs=1e-5)
+
+
 def test_the_corner_between_black_sectors_moves_along_its_bisector():
     (contour,) = spread_ink(shipped_patches()[0].black_region, 0.1)
     points = flatten((contour,), 1e-6)[0]
