@@ -19,6 +19,8 @@ from .dataset.labelled import LabelledImages as LabelledImages
 from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
+from .drift.datasets import DatasetDifference as DatasetDifference
+from .drift.datasets import diff as diff
 from .errors import KpbenchError as KpbenchError
 from .evaluate import ComparedFiles as ComparedFiles
 from .evaluate import ScoredFile as ScoredFile
