@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from kpbench.boards.candidates import determinants
@@ -62,16 +63,16 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
     limit : float
         Largest distance of a detection from its point, in disc radii.
     """
-    designs = {patch.patch_id: patch for patch in board.patches}
-    usable = np.isfinite(frames.xy[:, 0]) & (determinants(frames.A) > 0) & np.isin(patch_id, list(designs))
+    ids, letter = lattice.alphabet
+    read = np.searchsorted(ids[:-1], patch_id)
+    usable = np.isfinite(frames.xy[:, 0]) & (determinants(frames.A) > 0) & (ids[read] == patch_id)
     index = np.flatnonzero(usable)
     if not len(index):
         return []
-    ids, letter = np.unique(lattice.ids, return_inverse=True)
-    letter = letter.reshape(lattice.ids.shape)
-    errors = np.array([frame_errors(designs[key]) for key in ids.tolist()])
-    order = np.array([designs[key].symmetry_order for key in ids.tolist()])
-    read = np.searchsorted(ids, patch_id[index])
+    designs = board.patches
+    errors = np.array([frame_errors(patch) for patch in designs])
+    order = np.array([patch.symmetry_order for patch in designs])
+    read = read[index]
     scale, shape = np.asarray(errors[read].T, np.float64)
     frames = frames[index]
     found = list[FieldMatch]()
@@ -114,10 +115,16 @@ def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, 
     cells = cells - least[:, None]
     width, height = (cells.max(axis=(0, 1)) + 1).tolist()
     size = (rows + height - 1, columns + width - 1)
-    mask = np.zeros((4, order.size, *size))
+    fast = [scipy.fft.next_fast_len(length, real=True) for length in size]
+    mask = np.zeros((4, order.size, *fast))
     mask[np.arange(4)[:, None], seen, cells[..., 1], cells[..., 0]] = 1.0
-    spectrum = np.conj(np.fft.rfft2(mask)) * np.fft.rfft2(table, size)
-    evidence = np.fft.irfft2(spectrum.sum(axis=1), size)
+    spectrum = np.conj(scipy.fft.rfft2(mask)) * scipy.fft.rfft2(table, fast)
+    evidence = scipy.fft.irfft2(spectrum.sum(axis=1), fast)
+    places = [
+        np.r_[:field, length - rest : length]
+        for field, length, rest in zip((rows, columns), fast, (height - 1, width - 1), strict=True)
+    ]
+    evidence = evidence[:, places[0][:, None], places[1]]
     evidence += _orientation_evidence(piece, seen, order)[:, None, None]
     prior = np.log((1 - OTHER_LETTERS) / evidence.size)
     none = np.log(OTHER_LETTERS) + len(seen) * (np.log(1 / order.size) - outside)
@@ -144,6 +151,8 @@ def _orientation_evidence(piece: Piece, seen: Int, order: Int) -> Float:
 
 def _join(found: list[FieldMatch], board: Board, lattice: Lattice, index: Int, frames: Frames) -> list[FieldMatch]:
     """Join the lattices of one bent sheet: those that predict each other and share no point."""
+    if len(found) < 2:
+        return found
     radius_mm = board.keypoints[0].diameter_mm / 2
     origin = board.points_mm[lattice.points[0, 0], :2]
     joined = list[FieldMatch]()

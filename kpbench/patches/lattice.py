@@ -8,6 +8,7 @@ number of letters in which two words differ (the Hamming distance).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,6 +40,12 @@ class Lattice:
     ids: Int
     points: Int
     pitch: float
+
+    @cached_property
+    def alphabet(self) -> tuple[Int, Int]:
+        """The different IDs, in rising order, and the number of the ID in each row and column, shape (R, C)."""
+        ids, letter = np.unique(self.ids, return_inverse=True)
+        return ids, letter.reshape(self.ids.shape)
 
 
 def window_words(letters: Int, window: tuple[int, int] = WINDOW) -> Int:
