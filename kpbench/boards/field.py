@@ -110,13 +110,14 @@ def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, 
     seen = read[piece.rows]
     hit, miss, outside = np.log([1 - WRONG_LETTER, WRONG_LETTER / (order.size - 1), OUTSIDE])
     table = np.where(letter == np.arange(order.size)[:, None, None], hit, miss) - outside
+    table = table.astype(np.float32)  # transforms are fast, and evidence is exact to 0.001
     cells = piece.cell @ QUARTERS.transpose(0, 2, 1)  # (4, m, 2)
     least = cells.min(axis=1)
     cells = cells - least[:, None]
     width, height = (cells.max(axis=(0, 1)) + 1).tolist()
     size = (rows + height - 1, columns + width - 1)
     fast = [scipy.fft.next_fast_len(length, real=True) for length in size]
-    mask = np.zeros((4, order.size, *fast))
+    mask = np.zeros((4, order.size, *fast), np.float32)
     mask[np.arange(4)[:, None], seen, cells[..., 1], cells[..., 0]] = 1.0
     spectrum = np.conj(scipy.fft.rfft2(mask)) * scipy.fft.rfft2(table, fast)
     evidence = scipy.fft.irfft2(spectrum.sum(axis=1), fast)

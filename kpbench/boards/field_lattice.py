@@ -129,12 +129,15 @@ def find_pieces(frames: Frames, pitch: float, scale: Float, shape: Float, limit:
         Largest distance of a patch from its place, in disc radii.
     """
     n = len(frames.xy)
-    inverse, columns = np.asarray(np.linalg.inv(frames.A), np.float64), _make_columns(frames, scale, shape)
+    columns = _make_columns(frames, scale, shape)
+    (a, b), (c, d) = columns.A
+    inverse = (np.array([[d, -b], [-c, a]]) / (a * d - b * c)).transpose(2, 0, 1)
     edges = _find_edges(frames, inverse, pitch, scale)
     degree = np.bincount(edges.i, minlength=n)
     free, is_seed, pieces = np.ones(n, bool), degree > 1, list[Piece]()
-    for seed in np.argsort(-degree, kind="stable").tolist():
-        if not free[seed] or not is_seed[seed]:
+    seeds = np.argsort(-degree, kind="stable")
+    for seed in seeds[is_seed[seeds]].tolist():
+        if not free[seed]:
             continue
         for rounds in START_ROUNDS:
             start = _start(edges, seed, free, rounds)
@@ -295,10 +298,15 @@ def _fit_points(X: Float, xy: Float, weight: Float) -> Float:
 
 def _one_per_cell(rows: Int, cells: Int, off: Float) -> Int:
     """Return some of the rows, in ascending order: of those of one cell, the one that is the least off."""
-    order = np.argsort(off[rows])
-    rows = rows[order]
+    if not len(rows):
+        return rows
     x, y = cells[rows].T
-    return np.sort(rows[np.unique(x * FAR + y, return_index=True)[1]])
+    y = y - y.min()
+    key = (x - x.min()) * (y.max() + 1) + y
+    if np.bincount(key).max() > 1:
+        order = np.argsort(off[rows], kind="stable")
+        rows = np.sort(rows[order[np.unique(key[order], return_index=True)[1]]])
+    return rows
 
 
 def _errors(H: Float, columns: Columns, pitch: float) -> tuple[Int, Float, Int, Float, Float] | None:
