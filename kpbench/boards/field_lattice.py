@@ -235,12 +235,12 @@ def _grow(columns: Columns, pitch: float, limit: float, start: tuple[Int, Int, I
             return None
         all_cells, off, turned, scaled, bent = errors
         low, high = cell.min(axis=0), cell.max(axis=0)
-        reach = max(2, int((high - low).max()) // 2) if n else 0
+        reach = max(2, int((high - low).max()) // 2) if n else 1
         near = free & _is_between(all_cells, low - reach, high + reach)
         member = near & (off <= largest) & (scaled <= columns.most_scaled_member)
         fits = member & (scaled <= columns.most_scaled) & (bent <= columns.most_bent)
         at = _one_per_cell(np.flatnonzero(fits), all_cells, off)
-        if len(at) < LEAST_PIECE or (not n and len(at) < LEAST_START * len(rows)):
+        if len(at) < LEAST_PIECE or (not n and fits[rows].sum() < LEAST_START * len(rows)):
             return None
         fitted, cell, quarter = at, all_cells[at], turned[at]
         if n and np.array_equal(fitted, before):
