@@ -17,7 +17,7 @@ from kpbench.toml import TomlTable, name_source, read_toml
 BOARD_FILE_SCHEMA = "kpbench.board-design/1"
 GRID_PITCH = 2.0  # default pitch of a grid, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
-BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
+BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "field", "grid", "keypoint")
 GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
 KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
 SIZE_MM = (0.1, 5000.0)  # least and greatest diameter or pitch in a file
@@ -176,7 +176,7 @@ def parse_board(
     if "size_mm" in table:
         width, height = table.numbers("size_mm", 1.0, 50_000.0, 2)
         size = (width, height)
-    return Board(name, *size, keypoints)
+    return Board(name, *size, keypoints, is_field="field" in table and table.flag("field"))
 
 
 def _parse_grid(table: TomlTable, patches: Sequence[Patch], diameter_mm: float, name: str) -> Board:

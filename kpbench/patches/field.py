@@ -104,4 +104,4 @@ def field_board(
         for row, line in enumerate(fitting[0][:rows, :columns].tolist())
         for column, letter in enumerate(line)
     )
-    return Board(f"field-{rows}x{columns}", columns * pitch_mm, rows * pitch_mm, keypoints)
+    return Board(f"field-{rows}x{columns}", columns * pitch_mm, rows * pitch_mm, keypoints, is_field=True)

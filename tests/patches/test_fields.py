@@ -2,6 +2,7 @@
 
 import importlib.util
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -95,9 +96,26 @@ def test_a_printed_field_comes_back_from_its_sidecar(tmp_path):
     assert np.array_equal(read.lattice.ids, board.lattice.ids)
 
 
+def test_a_board_is_found_as_a_field_if_it_says_so(tmp_path):
+    """Not for its windows alone: a grid with the letters of a field stays a grid."""
+    field = field_board(shipped_patches(), 3, 4)
+    assert field.lattice.ids.shape == (3, 4)
+    assert replace(field, is_field=False).lattice is None
+    lines = [f"{{ patch = {k.patch_id}, x_mm = {k.x_mm}, y_mm = {k.y_mm} }}" for k in field.keypoints]
+    text = f"diameter_mm = 16\nkeypoint = [{', '.join(lines)}]\n"
+    (tmp_path / "board.toml").write_text(text)
+    assert load_board(tmp_path / "board.toml").lattice is None
+    (tmp_path / "field.toml").write_text(f"field = true\n{text}")
+    assert np.array_equal(load_board(tmp_path / "field.toml").lattice.ids, field.lattice.ids)
+    print_boards([replace(field, is_field=False)], tmp_path, formats=[])
+    assert load_board(tmp_path / "field-3x4.json").lattice is None
+
+
 def test_a_regular_grid_is_no_field():
-    for rows, columns in [(4, 3), (4, 5), (8, 8)]:
-        assert grid_board(shipped_patches(), rows, columns, 20.0, 40.0).lattice is None
+    for rows, columns in [(4, 3), (8, 8), (2, 9)]:
+        board = grid_board(shipped_patches(), rows, columns, 20.0, 40.0)
+        with pytest.raises(DesignError, match="board 'grid' is no field: expected upright patches of one size on a"):
+            replace(board, is_field=True)
 
 
 def test_impossible_fields_are_refused():
