@@ -39,7 +39,9 @@ class FieldMatch:
     """Detections and their places in a field.
 
     ``rows`` (m,) are detections, ``points`` (m,) the board's keypoints, ``turn`` (m, 2, 2) the rotations that leave
-    their designs unchanged and bring the frames into the board's orientation.
+    their designs unchanged and bring the frames into the board's orientation. ``evidence`` is the logarithm of the
+    probability of the letters at this place, and of the place before the letters are seen, up to a constant that all
+    fields share.
     """
 
     rows: Int
@@ -47,6 +49,7 @@ class FieldMatch:
     turn: Float
     agrees: NDArray[np.bool_]
     probability: float
+    evidence: float
     H: Float
 
 
@@ -77,7 +80,7 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
     frames = frames[index]
     found = list[FieldMatch]()
     for piece in find_pieces(frames, lattice.pitch, scale, shape, limit):
-        quarter, shift, probability = _place(piece, read, order, letter)
+        quarter, shift, probability, evidence = _place(piece, read, order, letter)
         cell = piece.cell @ QUARTERS[quarter].T + shift
         inside = ((cell >= 0) & (cell < letter.shape[::-1])).all(axis=1)
         right = np.zeros(len(cell), bool)
@@ -98,14 +101,15 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
                 np.where(is_turned[:, None, None], QUARTERS[-turns % 4], QUARTERS[0]).astype(float),
                 piece.fits[kept] & right[kept] & is_turned,
                 probability,
+                evidence,
                 piece.H @ to_lattice,
             )
         )
     return _join(found, board, lattice, index, frames)
 
 
-def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, float]:
-    """Return the most probable rotation of a piece, the shift (column, row) of its cells, and their probability."""
+def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, float, float]:
+    """Return the most probable rotation of a piece, the shift (column, row) of its cells, probability and evidence."""
     rows, columns = letter.shape
     seen = read[piece.rows]
     hit, miss, outside = np.log([1 - WRONG_LETTER, WRONG_LETTER / (order.size - 1), OUTSIDE])
@@ -134,7 +138,7 @@ def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, 
     probability = 1 / float(total + np.exp(min(none - prior - evidence.flat[best], 700.0)))
     quarter, y, x = (int(v) for v in np.unravel_index(best, evidence.shape))
     shift = np.array([x - size[1] if x >= columns else x, y - size[0] if y >= rows else y])
-    return quarter, shift - least[quarter], probability
+    return quarter, shift - least[quarter], probability, float(evidence.flat[best] + prior)
 
 
 def _orientation_evidence(piece: Piece, seen: Int, order: Int) -> Float:
@@ -176,6 +180,7 @@ def _join(found: list[FieldMatch], board: Board, lattice: Lattice, index: Int, f
                     np.concatenate([other.turn, match.turn]),
                     np.concatenate([other.agrees, match.agrees]),
                     min(other.probability, match.probability),
+                    other.evidence + match.evidence,
                     other.H,
                 )
                 break
