@@ -146,7 +146,8 @@ def locate_boards(
     Returns
     -------
     Predictions
-        With the columns ``board`` and ``points``. A match whose points are ambiguous has no points.
+        With the columns ``board`` and ``points``, and ``probability`` if there is a field. A match whose points are
+        ambiguous has no points.
     list of PoseRecord
         For each image and board one record, or one per copy of the board.
 
@@ -173,6 +174,7 @@ def locate_boards(
     if doubles := [name for name in names if names.count(name) > 1]:
         raise DataError(f"two boards have the name {doubles[0]!r}")
     board_of, points = np.full(len(predictions.xy), -1), np.full(len(predictions.xy), -1)
+    probability = np.zeros(len(predictions.xy))
     records = list[PoseRecord]()
     for n, (detections, (first, _)) in enumerate(
         zip(predictions.detections(), pairwise(predictions.offsets.tolist()), strict=True)
@@ -183,8 +185,11 @@ def locate_boards(
             for match in matches:
                 board_of[first + match.index] = k
                 points[first + match.index] = -1 if match.ambiguous else match.points
+                probability[first + match.index] = match.probability / (1 + len(match.alternatives))
             records += [_record(predictions, n, names[k], match, of_image) for match in matches or (None,)]
-    return replace(predictions, board=board_of, points=points, boards=tuple(names)), records
+    of_fields = probability if any(board.is_field for board in boards) else None
+    located = replace(predictions, board=board_of, points=points, boards=tuple(names), probability=of_fields)
+    return located, records
 
 
 def name_image(predictions: Predictions, n: int) -> str:

@@ -125,6 +125,12 @@ def test_two_copies_are_two_matches():
     assert [match.points.tolist() for match in matches] == [list(range(70))] * 2
     located, _ = locate_boards(Predictions.from_detections([both]), [BOARD])
     assert located.points.tolist() == [*range(70), *range(70)]
+    assert (located.probability > 0.999).all()
+    few = flat(BOARD)[rows_of(BOARD, 0, 0, 2, 2)]
+    unsure = Detections([*few.xy, [5000, 5000]], np.ones(5), [*few.patch_id, 0], [*few.A_patch2image, np.eye(2)])
+    located, _ = locate_boards(Predictions.from_detections([unsure]), [BOARD])
+    assert located.points.tolist() == [-1] * 5
+    assert located.probability[4] == 0 < located.probability[0] < 0.999
 
 
 def test_any_window_tells_which_of_many_fields_it_is():
