@@ -5,7 +5,7 @@ OpenCV. A scene has one pose, one photograph as its background, one set of cover
 are bars with round ends, cut from another photograph, that lie on the sheet until they cover a share of the area. The
 light goes through ``kpbench.camera.photograph``. In the worn scenes, it is blurred first, and noise is added after it.
 
-    python benchmarks/accuracy/fields_comparison.py --backgrounds photos/ [--scenes 20] [--seed 0]
+    python benchmarks/accuracy/fields_comparison.py --backgrounds photos/ [--scenes 20] [--seed 0] [--covered 0.6 0.8]
     python benchmarks/accuracy/fields_comparison.py --backgrounds photos/ --bent [--scenes 40] [--pictures DIR]
 
 A point is right if it lies within 3 px of its true place, and has a wrong identity if it does not. Poses come from
@@ -263,6 +263,8 @@ def judge(target: Target, view: View, image: np.ndarray) -> list[float]:
         return [*result, 0.0, np.nan, np.nan]
     points, xy = target.points_mm[index][fitting], xy[fitting]
     _, turns, shifts, _ = cv2.solvePnPGeneric(points, xy, K, None, flags=cv2.SOLVEPNP_IPPE)  # the best one first
+    if not turns:
+        return [*result, 0.0, np.nan, np.nan]
     turn, shift = cv2.solvePnPRefineLM(points, xy, K, None, turns[0], shifts[0])
     angle = np.degrees(np.linalg.norm(cv2.Rodrigues(cv2.Rodrigues(turn)[0] @ view.R.T)[0]))
     errors = float(angle), float(1e3 * np.linalg.norm(shift.ravel() - view.t) / view.t[2])
@@ -285,7 +287,7 @@ def run(args: argparse.Namespace) -> None:
     )
     print("|" + "---|" * 9)
     for worn in (False, True):
-        for covered in (0.0,) if args.bent else COVERED:
+        for covered in (0.0,) if args.bent else args.covered or COVERED:
             results: dict[str, list[list[float]]] = {name: [] for name in targets}
             for n in range(args.scenes):
                 rng = np.random.default_rng([args.seed, n])
@@ -315,6 +317,7 @@ def main() -> None:
     parser.add_argument("--backgrounds", type=Path, required=True, help="Folder of photographs.")
     parser.add_argument("--scenes", type=int, default=20, help="Scenes per rung.")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--covered", type=float, nargs="+", help="Shares of the area that are covered.")
     parser.add_argument("--bent", action="store_true", help="Show the field alone, on bent sheets.")
     parser.add_argument("--pictures", type=Path, help="Folder for the images of the first six scenes of each rung.")
     args = parser.parse_args()

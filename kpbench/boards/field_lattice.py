@@ -18,7 +18,7 @@ from kpbench.types import Float, Int
 Bools = NDArray[np.bool_]
 QUARTERS = np.array([[[1, 0], [0, 1]], [[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
 """Rotations by 0 to 3 quarters from +x towards +y."""
-TURNS = np.array([1, 1j, -1, -1j])
+QUARTER_TURNS = np.array([1, 1j, -1, -1j])
 """The same of complex numbers x + iy."""
 EDGE_ANGLE, EDGE_LENGTH, EDGE_TURN, EDGE_SCALE = 0.2, 0.45, 0.4, 0.7
 """Largest errors of an edge: of its direction, rad, of the logarithm of its length, of the rotation between the frames
@@ -165,7 +165,7 @@ def _find_edges(frames: Frames, inverse: Float, pitch: float, scale: Float) -> E
     dx, dy = (frames.xy[j] - frames.xy[i]).T
     to_x, to_y = (to_step[:, 0] + 1j * to_step[:, 1]).T
     there = to_x[i] * dx + to_y[i] * dy
-    back = -(to_x[j] * dx + to_y[j] * dy) * TURNS[quarter]
+    back = -(to_x[j] * dx + to_y[j] * dy) * QUARTER_TURNS[quarter]
     weight = 1 / (scale**2 + PERSPECTIVE**2)
     total = weight[i] + weight[j]
     mean = (there * weight[i] - back * weight[j]) / total

@@ -90,6 +90,7 @@ if TYPE_CHECKING:
 @click.pass_context
 def render_patches(
     ctx: click.Context,
+    /,
     out: Path,
     pdf: bool,
     svg: bool,
@@ -100,9 +101,6 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
-    rows: int,
-    columns: int,
-    fields: int,
     targets: tuple[str, ...],
     reference: bool,
     tile: bool,
@@ -113,6 +111,7 @@ def render_patches(
     invert: bool,
     no_labels: bool,
     measured: tuple[float, float] | None,
+    **size: int,
 ) -> None:
     """Print the patches or a board, true to scale.
 
@@ -150,7 +149,6 @@ def render_patches(
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
     own = patches if designs or chosen else None
-    size = {"rows": rows, "columns": columns, "fields": fields}
     boards = load_boards(board, own, diameter_mm, **size) if board is not None else ()
     if reference:
         boards = tuple(map(with_reference, boards))
