@@ -7,6 +7,7 @@ light goes through ``kpbench.camera.photograph``. In the worn scenes, it is blur
 
     python benchmarks/accuracy/fields_comparison.py --backgrounds photos/ [--scenes 20] [--seed 0] [--covered 0.6 0.8]
     python benchmarks/accuracy/fields_comparison.py --backgrounds photos/ --bent [--scenes 40] [--pictures DIR]
+    python benchmarks/accuracy/fields_comparison.py --figure-of docs/results/fields.md
 
 A point is right if it lies within 3 px of its true place, and has a wrong identity if it does not. Poses come from
 points that fit one homography, by ``cv2.solvePnPGeneric`` (IPPE), for all boards. Good poses are off by up to 2 degrees
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +33,7 @@ from kpbench.camera import CameraPreset, load_camera_preset, photograph, scene_l
 from kpbench.camera.paper import Cylinder
 from kpbench.detectors.tags import AprilTagDetector
 from kpbench.printing import PageFormat, board_sheet, to_pdf
+from kpbench.report.charts import CHART_STYLE, Series, line_chart
 
 WIDTH, HEIGHT, FOCAL = 960, 720, 1100.0
 K = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
@@ -312,9 +315,31 @@ def run(args: argparse.Namespace) -> None:
                 )
 
 
+def draw_figure(page: Path) -> None:
+    """Write the figure of a page with the table: points right per image over the covered share."""
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.read_text().splitlines()]
+    rows = [row for row in cells if row and row[0] in ("clear", "worn") and row[1].endswith("%") and len(row) == 9]
+    series = []
+    for kind, dashed in (("clear", False), ("worn", True)):
+        for style, name in enumerate(dict.fromkeys(row[2] for row in rows)):
+            points = [(float(row[1][:-1]), float(row[4])) for row in rows if row[0] == kind and row[2] == name]
+            x, y = zip(*sorted(points), strict=True)
+            series.append(Series(f"{name}, {kind}", x, y, style=style, dashed=dashed))
+    chart = re.sub(r"^<svg[^>]*>|</svg>$", "", line_chart(series, "covered, %", "points right per image"))
+    legend = "".join(
+        f'<g class="chart"><line class="s{s.style}{" dashed" if s.dashed else ""}" x1="490" x2="520" '
+        f'y1="{30 + 22 * n}" y2="{30 + 22 * n}" stroke-width="2"/><text x="528" y="{34 + 22 * n}">{s.name}</text></g>'
+        for n, s in enumerate(series)
+    )
+    head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 660 300" width="660" height="300">'
+    own = "svg{font:12px system-ui,sans-serif;color:#222}@media (prefers-color-scheme:dark){svg{color:#ddd}}"
+    page.with_suffix(".svg").write_text(f"{head}<style>{own}{CHART_STYLE}</style><g class="chart">{chart}</g>{legend}</svg>\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--backgrounds", type=Path, required=True, help="Folder of photographs.")
+    parser.add_argument("--backgrounds", type=Path, help="Folder of photographs.")
+    parser.add_argument("--figure-of", type=Path, help="Page with the table; write the figure beside it, and stop.")
     parser.add_argument("--scenes", type=int, default=20, help="Scenes per rung.")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--covered", type=float, nargs="+", help="Shares of the area that are covered.")
@@ -323,7 +348,12 @@ def main() -> None:
     args = parser.parse_args()
     if args.pictures:
         args.pictures.mkdir(parents=True, exist_ok=True)
-    run(args)
+    if args.figure_of:
+        draw_figure(args.figure_of)
+    elif args.backgrounds is None:
+        parser.error("expected --backgrounds")
+    else:
+        run(args)
 
 
 if __name__ == "__main__":
