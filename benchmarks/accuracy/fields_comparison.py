@@ -333,7 +333,8 @@ def draw_figure(page: Path) -> None:
     )
     head = '<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 660 300" width="660" height="300">'
     own = "svg{font:12px system-ui,sans-serif;color:#222}@media (prefers-color-scheme:dark){svg{color:#ddd}}"
-    page.with_suffix(".svg").write_text(f"{head}<style>{own}{CHART_STYLE}</style><g class="chart">{chart}</g>{legend}</svg>\n")
+    parts = f'{head}<style>{own}{CHART_STYLE}</style><g class="chart">{chart}</g>{legend}</svg>\n'
+    page.with_suffix(".svg").write_text(parts)
 
 
 def main() -> None:
