@@ -272,25 +272,23 @@ def _fit(columns: Columns, rows: Int, cell: Int, quarter: Int, pitch: float) -> 
 
 def _fit_points(X: Float, xy: Float, weight: Float) -> Float:
     """Fit a homography to points by weighted linear least squares, as :func:`fit_homography` without frames."""
-    middle, centre = X.mean(axis=0), xy.mean(axis=0)
+    n = len(X)
+    middle, centre = X.sum(axis=0) / n, xy.sum(axis=0) / n
     away, seen = X - middle, xy - centre
-    reach, gauge = np.sqrt(np.vdot(away, away) / len(X)), np.sqrt(np.vdot(seen, seen) / len(X))
-    P = np.empty((len(X), 3))
-    P[:, 0], P[:, 1:] = 1.0, away / reach
-    P *= weight[:, None]
-    x, y = (seen / gauge).T[:, :, None]
-    G = np.concatenate([P, x * P, y * P], axis=1)
+    reach, gauge = np.sqrt(np.vdot(away, away) / n), np.sqrt(np.vdot(seen, seen) / n)
+    G = np.empty((n, 9))
+    P, (x, y) = G[:, :3], seen.T / gauge
+    P[:, :2], P[:, 2] = away * (weight / reach)[:, None], weight
+    G[:, 3:6], G[:, 6:] = P * x[:, None], P * y[:, None]
     moments = G.T @ G
-    square, by_x, by_y = moments[:3, :3], moments[:3, 3:6], moments[:3, 6:]
-    normal = np.zeros((9, 9))  # unknown: the homography by rows, each of them (1, x, y)
-    normal[:3, :3] = normal[3:6, 3:6] = square
-    normal[:3, 6:], normal[3:6, 6:] = -by_x, -by_y
-    normal[6:, :3], normal[6:, 3:6] = -by_x.T, -by_y.T
+    normal = np.zeros((9, 9))  # unknown: the homography by rows; its last element is 1, in the middle of the points
+    normal[:3, :3] = normal[3:6, 3:6] = moments[:3, :3]
+    normal[:3, 6:], normal[3:6, 6:] = -moments[:3, 3:6], -moments[:3, 6:]
+    normal[6:, :6] = normal[:6, 6:].T
     normal[6:, 6:] = moments[3:6, 3:6] + moments[6:, 6:]
     normal.flat[::10] *= 1 + RIDGE
-    others = [0, 1, 2, 3, 4, 5, 7, 8]  # the homography is 1 in the middle of the points
-    h = np.linalg.solve(normal[np.ix_(others, others)], -normal[others, 6])
-    H = np.array([[h[1], h[2], h[0]], [h[4], h[5], h[3]], [h[6], h[7], 1.0]])
+    h = np.linalg.solve(normal[:8, :8], -normal[:8, 8])
+    H = np.append(h, 1.0).reshape(3, 3)
     to_plane = np.array([[1, 0, -middle[0]], [0, 1, -middle[1]], [0, 0, reach]])
     to_image = np.array([[gauge, 0, centre[0]], [0, gauge, centre[1]], [0, 0, 1.0]])
     return np.asarray(to_image @ H @ to_plane)

@@ -300,10 +300,12 @@ def _make_field_match(
 ) -> BoardMatch:
     order = np.argsort(field.rows)
     rows, turn = field.rows[order], field.turn[order]
-    found, straight = detections[rows], frames[rows]
-    assert found.A_patch2image is not None
-    found = replace(found, A_patch2image=found.A_patch2image @ turn)
-    straight = replace(straight, A=straight.A @ turn)
+    d, straight = detections, frames[rows]
+    assert d.A_patch2image is not None
+    assert d.patch_id is not None
+    optional = (None if column is None else column[rows] for column in (d.covariance, d.blur_px))
+    found = Detections(d.xy[rows], d.score[rows], d.patch_id[rows], d.A_patch2image[rows] @ turn, *optional)
+    straight = Frames(straight.xy, straight.A @ turn, straight.covariance)
     of_board = board, rows, field.points[order], found, field.agrees[order], ()
     is_sure = field.probability >= LEAST_PROBABILITY
     return BoardMatch(*of_board, is_sure, field.probability, field.evidence, camera, straight)
