@@ -89,6 +89,13 @@ def test_few_patches_are_not_sure():
     assert find_board(Detections.none(), BOARD) == ()
 
 
+def test_patches_on_a_diagonal_make_a_lattice():
+    """Points on a line do not tell a homography: the frames must."""
+    rows = np.array([LARGE.lattice.points[k, k] for k in range(12)])
+    [match] = find_board(flat(LARGE)[rows], LARGE)
+    assert match.points.tolist() == rows.tolist()
+
+
 def test_half_turned_checkers_are_brought_into_the_orientation_of_the_board():
     found = flat(BOARD)
     A = np.where((found.patch_id == 0)[:, None, None], -found.A_patch2image, found.A_patch2image)
