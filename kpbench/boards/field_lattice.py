@@ -40,9 +40,9 @@ LEAST_PIECE = 4
 MANY, FRAMES_OF_MANY = 6, 30.0
 """From ``MANY`` patches on, points tell the homography, and the errors of frames are taken to be larger by this factor:
 frames bias the perspective."""
-POINTS_ALONE, LEAST_SPREAD = 9, 0.3
+POINTS_ALONE, LEAST_CELL_SPREAD = 9, 0.3
 """From ``POINTS_ALONE`` patches on, points alone tell the homography, if the cells are not on a line nor almost: with
-the variances a and b of the cells along their axes, ``a b / (a + b)`` is at least ``LEAST_SPREAD``. It is 1/3 for 3 x 3
+the variances a and b of the cells along their axes, ``a b / (a + b)`` is at least ``LEAST_CELL_SPREAD``. It is 1/3 for 3 x 3
 cells, and at most 1/4 for two rows."""
 FAR = 100_003
 """More than the rows of any field."""
@@ -267,7 +267,7 @@ def _fit(columns: Columns, rows: Int, cell: Int, quarter: Int, pitch: float) -> 
     X = np.asarray(cell * pitch, np.float64)
     away = cell - cell.sum(axis=0) / len(cell)
     (xx, xy), (_, yy) = (away.T @ away / len(cell)).tolist()
-    if len(rows) >= POINTS_ALONE and xx * yy - xy * xy >= LEAST_SPREAD * (xx + yy):
+    if len(rows) >= POINTS_ALONE and xx * yy - xy * xy >= LEAST_CELL_SPREAD * (xx + yy):
         return _fit_points(X, columns.frames.xy[rows], columns.weight[rows])
     J = np.asarray(columns.frames.A[rows] @ QUARTERS[-quarter % 4], np.float64)
     weak = FRAMES_OF_MANY if len(rows) >= MANY else 1.0
