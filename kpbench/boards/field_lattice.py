@@ -42,8 +42,8 @@ MANY, FRAMES_OF_MANY = 6, 30.0
 frames bias the perspective."""
 POINTS_ALONE, LEAST_CELL_SPREAD = 9, 0.3
 """From ``POINTS_ALONE`` patches on, points alone tell the homography, if the cells are not on a line nor almost: with
-the variances a and b of the cells along their axes, ``a b / (a + b)`` is at least ``LEAST_CELL_SPREAD``. It is 1/3 for 3 x 3
-cells, and at most 1/4 for two rows."""
+the variances a and b of the cells along their axes, ``a b / (a + b)`` is at least ``LEAST_CELL_SPREAD``. It is 1/3 for
+3 x 3 cells, and at most 1/4 for two rows."""
 FAR = 100_003
 """More than the rows of any field."""
 FITS = 12
