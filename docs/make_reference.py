@@ -42,7 +42,7 @@ Results go to standard output, messages and progress to standard error.
 | exit code | meaning |
 |---|---|
 | 0 | done |
-| 1 | the input or the data is bad, or a gate (`--min`, `--max`, `--fail-on-regression`) failed; one line says why |
+| 1 | the input or the data is bad, or a gate (`--min`, `--max`, `--no-worse`, `--fail-on-…`) failed; one line tells |
 | 2 | wrong usage |
 | 130 | interrupted |
 """

@@ -19,6 +19,8 @@ from .dataset.labelled import LabelledImages as LabelledImages
 from .detectors.interface import Detector as Detector
 from .detectors.interface import load_detector as load_detector
 from .detectors.prediction import predict as predict
+from .drift.datasets import DatasetDifference as DatasetDifference
+from .drift.datasets import diff as diff
 from .errors import KpbenchError as KpbenchError
 from .evaluate import ComparedFiles as ComparedFiles
 from .evaluate import ScoredFile as ScoredFile
@@ -35,6 +37,7 @@ from .patches.design import Patch as Patch
 from .patches.design import load_patches as load_patches
 from .patches.design import shipped_patches as shipped_patches
 from .patches.field import field_board as field_board
+from .patches.field import field_boards as field_boards
 from .patches.reference_boards import truth_board as truth_board
 from .patches.reference_boards import with_reference as with_reference
 from .predictions.files import read_predictions as read_predictions

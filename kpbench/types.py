@@ -222,6 +222,8 @@ class Predictions:
     board, points : ndarray of shape (K,), int64, or None
         Number of the board that each detection is a part of, in ``boards``, and index of the board's keypoint; -1 for
         none. A detection of a board whose points are ambiguous has a board and no point. Both are given or none.
+    probability : ndarray of shape (K,), float64, or None
+        Probability of the most probable point of each detection, also of one that is ambiguous; 0 for no board.
     boards : tuple of str
         Names of the boards that were looked for.
     file : tuple of N str, or None
@@ -279,6 +281,7 @@ class Predictions:
     board: Int | None = None
     points: Int | None = None
     boards: tuple[str, ...] = ()
+    probability: Float | None = None
 
     def __post_init__(self) -> None:
         assign = object.__setattr__
@@ -288,7 +291,7 @@ class Predictions:
         assign(self, "score", np.ascontiguousarray(self.score, np.float64).reshape(-1))
         if self.patch_id is not None:
             assign(self, "patch_id", np.ascontiguousarray(self.patch_id, np.int64).reshape(-1))
-        for name in ("A_patch2image", "covariance", "blur_px"):
+        for name in ("A_patch2image", "covariance", "blur_px", "probability"):
             if getattr(self, name) is not None:
                 assign(self, name, np.ascontiguousarray(getattr(self, name), np.float64))
         for name in ("board", "points"):

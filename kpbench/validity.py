@@ -85,13 +85,15 @@ def check_columns(p: Any) -> None:
     if len(p.score) != k or len(ids) != k:
         raise PredictionsError(f"{k} keypoints, {len(p.score)} scores and {len(ids)} ids do not belong together")
     shapes = {"A_patch2image": (k, 2, 2), "covariance": (k, 2, 2), "size": (n, 2)}
-    shapes |= {"blur_px": (k,), "board": (k,), "points": (k,)}
+    shapes |= {"blur_px": (k,), "board": (k,), "points": (k,), "probability": (k,)}
     for name in (*shapes, "frame_index", "time_s", "ms"):
         shape, column = shapes.get(name, (n,)), getattr(p, name)
         if column is not None and column.shape != shape:
             raise PredictionsError(f"{name} has shape {column.shape}, expected {shape}")
     if (p.board is None) != (p.points is None):
         raise PredictionsError("one of board and points is missing, expected both or none")
+    if p.probability is not None and p.points is None:
+        raise PredictionsError("probability is given without board and points")
     if p.file is not None and len(p.file) != n:
         raise PredictionsError(f"{n} images have {len(p.file)} file names, expected one per image")
     _check_images(p)
@@ -136,6 +138,7 @@ def _check_detections(p: Any, ids: NDArray[np.int64]) -> None:
         ("blur_px", p.blur_px, lambda v: (v >= 0) & (v < np.inf), "a finite number of 0 or more"),
         ("board", p.board, lambda v: (v >= -1) & (v < len(p.boards)), "the number of one of the boards, or -1"),
         ("points", p.points, lambda v: (v == -1) | ((v >= 0) & (p.board >= 0)), "the index of a board's point, or -1"),
+        ("probability", p.probability, lambda v: (v >= 0) & (v <= 1), "a number from 0 to 1"),
     )
     for name, column, is_valid, expected in rules:
         if column is not None and not (valid := is_valid(column)).all():

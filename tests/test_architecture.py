@@ -65,6 +65,7 @@ ROOMS = {
     "analysis": ["geometry", "camera", "patches", "printing", "render"],
     "scoring": ["geometry"],
     "report": ["scoring"],
+    "drift": ["dataset", "predictions", "scoring", "report"],
     "fitting": ["geometry", "patches"],
     "detectors": ["geometry", "patches", "fitting", "predictions", "dataset"],
     "tracking": ["geometry", "patches", "boards", "fitting", "detectors", "dataset", "synth", "scoring"],

@@ -35,6 +35,7 @@ suite extended-v1 --images 1 --size 203x155 --out extended
 suite paper-v1 --images 1 --size 203x155 --only pitch --board charuco --out tags
 inspect set
 verify set
+diff set set --json diff.json
 preview set --count 4 --out sheet.png
 export set --format coco --out coco
 export set --format yolo --out yolo

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 from kpbench.boards.candidates import determinants
@@ -38,7 +39,9 @@ class FieldMatch:
     """Detections and their places in a field.
 
     ``rows`` (m,) are detections, ``points`` (m,) the board's keypoints, ``turn`` (m, 2, 2) the rotations that leave
-    their designs unchanged and bring the frames into the board's orientation.
+    their designs unchanged and bring the frames into the board's orientation. ``evidence`` is the logarithm of the
+    probability of the letters at this place, and of the place before the letters are seen, up to a constant that all
+    fields share.
     """
 
     rows: Int
@@ -46,6 +49,7 @@ class FieldMatch:
     turn: Float
     agrees: NDArray[np.bool_]
     probability: float
+    evidence: float
     H: Float
 
 
@@ -62,21 +66,21 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
     limit : float
         Largest distance of a detection from its point, in disc radii.
     """
-    designs = {patch.patch_id: patch for patch in board.patches}
-    usable = np.isfinite(frames.xy[:, 0]) & (determinants(frames.A) > 0) & np.isin(patch_id, list(designs))
+    ids, letter = lattice.alphabet
+    read = np.searchsorted(ids[:-1], patch_id)
+    usable = np.isfinite(frames.xy[:, 0]) & (determinants(frames.A) > 0) & (ids[read] == patch_id)
     index = np.flatnonzero(usable)
     if not len(index):
         return []
-    ids, letter = np.unique(lattice.ids, return_inverse=True)
-    letter = letter.reshape(lattice.ids.shape)
-    errors = np.array([frame_errors(designs[key]) for key in ids.tolist()])
-    order = np.array([designs[key].symmetry_order for key in ids.tolist()])
-    read = np.searchsorted(ids, patch_id[index])
+    designs = board.patches
+    errors = np.array([frame_errors(patch) for patch in designs])
+    order = np.array([patch.symmetry_order for patch in designs])
+    read = read[index]
     scale, shape = np.asarray(errors[read].T, np.float64)
     frames = frames[index]
     found = list[FieldMatch]()
     for piece in find_pieces(frames, lattice.pitch, scale, shape, limit):
-        quarter, shift, probability = _place(piece, read, order, letter)
+        quarter, shift, probability, evidence = _place(piece, read, order, letter)
         cell = piece.cell @ QUARTERS[quarter].T + shift
         inside = ((cell >= 0) & (cell < letter.shape[::-1])).all(axis=1)
         right = np.zeros(len(cell), bool)
@@ -97,27 +101,35 @@ def match_field(frames: Frames, patch_id: Int, board: Board, lattice: Lattice, l
                 np.where(is_turned[:, None, None], QUARTERS[-turns % 4], QUARTERS[0]).astype(float),
                 piece.fits[kept] & right[kept] & is_turned,
                 probability,
+                evidence,
                 piece.H @ to_lattice,
             )
         )
     return _join(found, board, lattice, index, frames)
 
 
-def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, float]:
-    """Return the most probable rotation of a piece, the shift (column, row) of its cells, and their probability."""
+def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, float, float]:
+    """Return the most probable rotation of a piece, the shift (column, row) of its cells, probability and evidence."""
     rows, columns = letter.shape
     seen = read[piece.rows]
     hit, miss, outside = np.log([1 - WRONG_LETTER, WRONG_LETTER / (order.size - 1), OUTSIDE])
     table = np.where(letter == np.arange(order.size)[:, None, None], hit, miss) - outside
+    table = table.astype(np.float32)  # transforms are fast, and evidence is exact to 0.001
     cells = piece.cell @ QUARTERS.transpose(0, 2, 1)  # (4, m, 2)
     least = cells.min(axis=1)
     cells = cells - least[:, None]
     width, height = (cells.max(axis=(0, 1)) + 1).tolist()
     size = (rows + height - 1, columns + width - 1)
-    mask = np.zeros((4, order.size, *size))
+    fast = [scipy.fft.next_fast_len(length, real=True) for length in size]
+    mask = np.zeros((4, order.size, *fast), np.float32)
     mask[np.arange(4)[:, None], seen, cells[..., 1], cells[..., 0]] = 1.0
-    spectrum = np.conj(np.fft.rfft2(mask)) * np.fft.rfft2(table, size)
-    evidence = np.fft.irfft2(spectrum.sum(axis=1), size)
+    spectrum = np.conj(scipy.fft.rfft2(mask)) * scipy.fft.rfft2(table, fast)
+    evidence = scipy.fft.irfft2(spectrum.sum(axis=1), fast)
+    places = [
+        np.r_[:field, length - rest : length]
+        for field, length, rest in zip((rows, columns), fast, (height - 1, width - 1), strict=True)
+    ]
+    evidence = evidence[:, places[0][:, None], places[1]]
     evidence += _orientation_evidence(piece, seen, order)[:, None, None]
     prior = np.log((1 - OTHER_LETTERS) / evidence.size)
     none = np.log(OTHER_LETTERS) + len(seen) * (np.log(1 / order.size) - outside)
@@ -126,7 +138,7 @@ def _place(piece: Piece, read: Int, order: Int, letter: Int) -> tuple[int, Int, 
     probability = 1 / float(total + np.exp(min(none - prior - evidence.flat[best], 700.0)))
     quarter, y, x = (int(v) for v in np.unravel_index(best, evidence.shape))
     shift = np.array([x - size[1] if x >= columns else x, y - size[0] if y >= rows else y])
-    return quarter, shift - least[quarter], probability
+    return quarter, shift - least[quarter], probability, float(evidence.flat[best] + prior)
 
 
 def _orientation_evidence(piece: Piece, seen: Int, order: Int) -> Float:
@@ -144,6 +156,8 @@ def _orientation_evidence(piece: Piece, seen: Int, order: Int) -> Float:
 
 def _join(found: list[FieldMatch], board: Board, lattice: Lattice, index: Int, frames: Frames) -> list[FieldMatch]:
     """Join the lattices of one bent sheet: those that predict each other and share no point."""
+    if len(found) < 2:
+        return found
     radius_mm = board.keypoints[0].diameter_mm / 2
     origin = board.points_mm[lattice.points[0, 0], :2]
     joined = list[FieldMatch]()
@@ -166,6 +180,7 @@ def _join(found: list[FieldMatch], board: Board, lattice: Lattice, index: Int, f
                     np.concatenate([other.turn, match.turn]),
                     np.concatenate([other.agrees, match.agrees]),
                     min(other.probability, match.probability),
+                    other.evidence + match.evidence,
                     other.H,
                 )
                 break

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from kpbench.boards.field import LEAST_PROBABILITY
 from kpbench.boards.matching import BoardMatch, find_board
 from kpbench.boards.pose import BoardPose, estimate_pose
 from kpbench.errors import DataError
@@ -64,7 +65,8 @@ def find_boards(
     """Find several boards in one image.
 
     If two boards explain one detection, the match with more points counts. With as many points, both matches are
-    alternatives of each other, and are therefore ambiguous.
+    alternatives of each other, and are therefore ambiguous. Of two fields, the more probable one counts, and its
+    ``probability`` takes the other one into account.
 
     Parameters
     ----------
@@ -94,6 +96,9 @@ def find_boards(
     [[True], [True]]
     """
     found = [(n, match) for n, board in enumerate(boards) for match in find_board(detections, board, camera)]
+    found = _choose_fields([item for item in found if item[1].board.is_field]) + [
+        item for item in found if not item[1].board.is_field
+    ]
     found.sort(key=lambda item: -len(item[1].points))
     kept = list[tuple[int, BoardMatch]]()
     for n, match in found:
@@ -107,6 +112,21 @@ def find_boards(
             match = replace(match, alternatives=(*match.alternatives, replace(other, alternatives=())))
         kept.append((n, match))
     return tuple(tuple(match for m, match in kept if m == n) for n in range(len(boards)))
+
+
+def _choose_fields(found: list[tuple[int, BoardMatch]]) -> list[tuple[int, BoardMatch]]:
+    """Return the matches of fields, of those that share detections the most probable one, by Bayes' rule over all."""
+    kept = list[tuple[int, BoardMatch]]()
+    for n, match in sorted(found, key=lambda item: -item[1].evidence):
+        rivals = [k for k, (_, other) in enumerate(kept) if np.isin(match.index, other.index).any()]
+        if not rivals:
+            kept.append((n, match))
+        for k in rivals:
+            m, other = kept[k]
+            lost = np.exp(match.evidence - other.evidence) / match.probability
+            probability = 1 / (1 / other.probability + float(lost))
+            kept[k] = m, replace(other, probability=probability, is_sure=probability >= LEAST_PROBABILITY)
+    return kept
 
 
 def locate_boards(
@@ -126,7 +146,8 @@ def locate_boards(
     Returns
     -------
     Predictions
-        With the columns ``board`` and ``points``. A match whose points are ambiguous has no points.
+        With the columns ``board`` and ``points``, and ``probability`` if there is a field. A match whose points are
+        ambiguous has no points.
     list of PoseRecord
         For each image and board one record, or one per copy of the board.
 
@@ -153,6 +174,7 @@ def locate_boards(
     if doubles := [name for name in names if names.count(name) > 1]:
         raise DataError(f"two boards have the name {doubles[0]!r}")
     board_of, points = np.full(len(predictions.xy), -1), np.full(len(predictions.xy), -1)
+    probability = np.zeros(len(predictions.xy))
     records = list[PoseRecord]()
     for n, (detections, (first, _)) in enumerate(
         zip(predictions.detections(), pairwise(predictions.offsets.tolist()), strict=True)
@@ -163,8 +185,11 @@ def locate_boards(
             for match in matches:
                 board_of[first + match.index] = k
                 points[first + match.index] = -1 if match.ambiguous else match.points
+                probability[first + match.index] = match.probability / (1 + len(match.alternatives))
             records += [_record(predictions, n, names[k], match, of_image) for match in matches or (None,)]
-    return replace(predictions, board=board_of, points=points, boards=tuple(names)), records
+    of_fields = probability if any(board.is_field for board in boards) else None
+    located = replace(predictions, board=board_of, points=points, boards=tuple(names), probability=of_fields)
+    return located, records
 
 
 def name_image(predictions: Predictions, n: int) -> str:

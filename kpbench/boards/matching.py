@@ -69,6 +69,9 @@ class BoardMatch:
         and blur makes the orientation doubtful.
     probability : float
         On a field, the probability of the points; 1 on other boards, where ``alternatives`` tells what else may be.
+    evidence : float
+        On a field, the logarithm of how probable the detections are with these points, up to a constant; 0 on other
+        boards. :func:`kpbench.boards.find_boards` compares fields by it.
     camera : Camera or None
         Camera with which the board was found.
     frames : Frames or None
@@ -95,6 +98,7 @@ class BoardMatch:
     alternatives: tuple[BoardMatch, ...] = ()
     is_sure: bool = True
     probability: float = 1.0
+    evidence: float = 0.0
     camera: Camera | None = None
     frames: Frames | None = None
 
@@ -285,7 +289,7 @@ def _choose(
         is_sure = _has_sharp_patches(found) or not _depends_on_frames(c.point, board)
         is_sure &= e.count > FEW or e.cost_per_freedom <= FEW_COST
         return BoardMatch(
-            board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), is_sure, 1.0, camera, straight
+            board, c.detection, c.point, found, e.agrees, tuple(map(make, others)), is_sure, 1.0, 0.0, camera, straight
         )
 
     return tuple(make(*group) for group in chosen)
@@ -296,13 +300,15 @@ def _make_field_match(
 ) -> BoardMatch:
     order = np.argsort(field.rows)
     rows, turn = field.rows[order], field.turn[order]
-    found, straight = detections[rows], frames[rows]
-    assert found.A_patch2image is not None
-    found = replace(found, A_patch2image=found.A_patch2image @ turn)
-    straight = replace(straight, A=straight.A @ turn)
+    d, straight = detections, frames[rows]
+    assert d.A_patch2image is not None
+    assert d.patch_id is not None
+    optional = (None if column is None else column[rows] for column in (d.covariance, d.blur_px))
+    found = Detections(d.xy[rows], d.score[rows], d.patch_id[rows], d.A_patch2image[rows] @ turn, *optional)
+    straight = Frames(straight.xy, straight.A @ turn, straight.covariance)
     of_board = board, rows, field.points[order], found, field.agrees[order], ()
     is_sure = field.probability >= LEAST_PROBABILITY
-    return BoardMatch(*of_board, is_sure, field.probability, camera, straight)
+    return BoardMatch(*of_board, is_sure, field.probability, field.evidence, camera, straight)
 
 
 def _has_sharp_patches(found: Detections) -> bool:

@@ -29,6 +29,7 @@ COMMANDS = {
     "inspect": ("dataset:inspect", "Print what a dataset holds."),
     "verify": ("dataset:verify", "Compare every byte of a dataset with its manifest."),
     "preview": ("dataset:preview", "Draw a contact sheet with the true keypoints."),
+    "diff": ("diff:diff", "Compare two datasets, or two versions of one."),
     "export": ("dataset:export", "Write a dataset as COCO, YOLO-pose, WebDataset or Parquet."),
     "detect": ("detect:detect", "Run a detector over a dataset or image files."),
     "track": ("track:track", "Follow a board through a film or a camera, and write its poses."),

@@ -51,6 +51,13 @@ if TYPE_CHECKING:
 )
 @click.option("--rows", type=click.IntRange(3, 100), default=10, show_default=True, help="Rows of a field.")
 @click.option("--columns", type=click.IntRange(3, 100), default=7, show_default=True, help="Columns of a field.")
+@click.option(
+    "--fields",
+    type=click.IntRange(1, 1000),
+    default=1,
+    show_default=True,
+    help="Number of fields, for several boards that are told from each other.",
+)
 @click.option("--reference", is_flag=True, help="Put a ring of reference marks around the board.")
 @click.option("--tile", is_flag=True, help="Spread a board that is larger than the page over several pages.")
 @click.option(
@@ -83,6 +90,7 @@ if TYPE_CHECKING:
 @click.pass_context
 def render_patches(
     ctx: click.Context,
+    /,
     out: Path,
     pdf: bool,
     svg: bool,
@@ -93,8 +101,6 @@ def render_patches(
     landscape: bool,
     dpi: int,
     board: str | None,
-    rows: int,
-    columns: int,
     targets: tuple[str, ...],
     reference: bool,
     tile: bool,
@@ -105,6 +111,7 @@ def render_patches(
     invert: bool,
     no_labels: bool,
     measured: tuple[float, float] | None,
+    **size: int,
 ) -> None:
     """Print the patches or a board, true to scale.
 
@@ -120,6 +127,7 @@ def render_patches(
       kpbench render-patches --board grid --target opencv --target kalibr
       kpbench render-patches --board truth --pdf
       kpbench render-patches --board field --rows 11 --columns 8 --diameter-mm 14
+      kpbench render-patches --board field --fields 6 --rows 5 --columns 5
       kpbench render-patches --measured 99.8,100.1
     """
     from kpbench.cli.progress import progress_bar
@@ -141,7 +149,7 @@ def render_patches(
     if chosen:
         patches = tuple(dict.fromkeys(find_patch(patches, key) for key in chosen))
     own = patches if designs or chosen else None
-    boards = load_boards(board, own, diameter_mm, rows=rows, columns=columns) if board is not None else ()
+    boards = load_boards(board, own, diameter_mm, **size) if board is not None else ()
     if reference:
         boards = tuple(map(with_reference, boards))
     wanted = [name for name, asked in {"pdf": pdf, "svg": svg, "png": png, "dxf": dxf}.items() if asked] or ["pdf"]
@@ -179,7 +187,7 @@ def _check_usage(given: set[str], board: str | None) -> None:
         raise click.UsageError("--reference adds marks to a board; give --board.")
     if board is not None and "copies" in given:
         raise click.UsageError("--copies is for patches to cut out, not for a --board.")
-    if board != "field" and given & {"rows", "columns"}:
-        raise click.UsageError("--rows and --columns are the size of a --board field.")
+    if board != "field" and given & {"rows", "columns", "fields"}:
+        raise click.UsageError("--rows, --columns and --fields are for --board field.")
     if board not in (None, "hexagon", "grid", "truth", "field") and "chosen" in given:
         raise click.UsageError("--patch does not go with a board file, which names its patches itself.")

@@ -12,6 +12,7 @@ from .design import SemiCircle as SemiCircle
 from .design import load_patches as load_patches
 from .design import shipped_patches as shipped_patches
 from .field import field_board as field_board
+from .field import field_boards as field_boards
 from .field import shipped_field as shipped_field
 from .lattice import field_distance as field_distance
 from .reference import ReferenceMark as ReferenceMark

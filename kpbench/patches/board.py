@@ -144,12 +144,15 @@ class Board:
         At least one keypoint.
     references : tuple of ReferenceMark
         Marks that tell the pose of the board without its patches.
+    is_field : bool
+        Whether the board is found as a field: by any window of 3 x 3 patches, see :func:`kpbench.field_board`.
 
     Raises
     ------
     DesignError
         If the board has no keypoint, a patch or a mark reaches over the edge of the board, two patches or marks
-        overlap, two marks have one id, or two different designs share an id.
+        overlap, two marks have one id, or two different designs share an id. If a field is no full square lattice, or
+        two of its windows look the same in a rotation.
 
     Examples
     --------
@@ -164,6 +167,7 @@ class Board:
     side_y_mm: float
     keypoints: tuple[BoardKeypoint, ...]
     references: tuple[ReferenceMark, ...] = ()
+    is_field: bool = False
 
     def __post_init__(self) -> None:
         if not self.keypoints:
@@ -188,6 +192,11 @@ class Board:
         for k in self.keypoints:
             if seen.setdefault(k.patch.patch_id, k.patch).digest != k.patch.digest:
                 raise DesignError(f"board {self.name!r}: two designs share the id {k.patch.patch_id}")
+        if self.is_field and self.lattice is None:
+            raise DesignError(
+                f"board {self.name!r} is no field: expected upright patches of one size on a full square lattice, and "
+                "windows of 3 x 3 that all differ in all rotations"
+            )
         side = np.array([self.side_x_mm, self.side_y_mm])
         check_references(self.name, self.references, side, np.stack([x, y], axis=1), extent)
 
@@ -209,6 +218,8 @@ class Board:
     @cached_property
     def lattice(self) -> Lattice | None:
         """Rows and columns of the patches if the board is a field, see :func:`kpbench.field_board`; None otherwise."""
+        if not self.is_field:
+            return None
         rows = np.array([(k.x_mm, k.y_mm, k.rotate_deg, k.diameter_mm) for k in self.keypoints])
         ids = np.array([k.patch_id for k in self.keypoints])
         return find_lattice(rows[:, :2], ids, rows[:, 2], rows[:, 3])

@@ -10,14 +10,14 @@ from kpbench.errors import DesignError
 from kpbench.patches.board import HEXAGON_DIAMETER, Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.board_sidecar import read_board_sidecar
 from kpbench.patches.design import Patch, load_patches, shipped_patches
-from kpbench.patches.field import FIELD_COLUMNS, FIELD_DIAMETER_MM, FIELD_ROWS, field_board
+from kpbench.patches.field import FIELD_COLUMNS, FIELD_DIAMETER_MM, FIELD_ROWS, field_boards
 from kpbench.patches.reference_boards import TRUTH_DIAMETER_MM, truth_board
 from kpbench.toml import TomlTable, name_source, read_toml
 
 BOARD_FILE_SCHEMA = "kpbench.board-design/1"
 GRID_PITCH = 2.0  # default pitch of a grid, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
-BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "grid", "keypoint")
+BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "field", "grid", "keypoint")
 GRID_KEYS = ("rows", "columns", "pitch_mm", "patches")
 KEYPOINT_KEYS = ("patch", "x_mm", "y_mm", "rotate_deg", "diameter_mm")
 SIZE_MM = (0.1, 5000.0)  # least and greatest diameter or pitch in a file
@@ -101,6 +101,7 @@ def load_boards(
     *,
     rows: int = FIELD_ROWS,
     columns: int = FIELD_COLUMNS,
+    fields: int = 1,
 ) -> tuple[Board, ...]:
     """Return the boards of a name, or the board of a file.
 
@@ -108,7 +109,7 @@ def load_boards(
     ----------
     name : str or Path
         "hexagon" for a hexagon board per design, "grid" for one grid of 4 rows and 3 columns, "truth" for
-        :func:`kpbench.truth_board`, "field" for :func:`kpbench.field_board`, or a file as for
+        :func:`kpbench.truth_board`, "field" for :func:`kpbench.field_boards`, or a file as for
         :func:`kpbench.load_board`.
     patches : sequence of Patch, optional
         Designs on the boards. Default: the shipped designs, or as in the file.
@@ -116,6 +117,8 @@ def load_boards(
         Diameter of the discs. Default: 30, or 24 for the truth board, 16 for a field, or as in the file.
     rows, columns : int
         Size of a field. Other boards ignore them.
+    fields : int
+        Number of fields, see :func:`kpbench.field_boards`. Other boards ignore it.
 
     Raises
     ------
@@ -134,7 +137,7 @@ def load_boards(
     if name == "truth":
         return (truth_board(designs, diameter_mm or TRUTH_DIAMETER_MM),)
     if name == "field":
-        return (field_board(designs, rows, columns, diameter_mm or FIELD_DIAMETER_MM),)
+        return field_boards(designs, fields, rows, columns, diameter_mm or FIELD_DIAMETER_MM)
     if name == "grid":
         return (grid_board(designs, 4, 3, diameter, GRID_PITCH * diameter),)
     if not Path(name).is_file():
@@ -176,7 +179,7 @@ def parse_board(
     if "size_mm" in table:
         width, height = table.numbers("size_mm", 1.0, 50_000.0, 2)
         size = (width, height)
-    return Board(name, *size, keypoints)
+    return Board(name, *size, keypoints, is_field="field" in table and table.flag("field"))
 
 
 def _parse_grid(table: TomlTable, patches: Sequence[Patch], diameter_mm: float, name: str) -> Board:

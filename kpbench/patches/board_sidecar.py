@@ -71,7 +71,8 @@ def _parse(content: dict[str, Any], patches: Sequence[Patch]) -> Board:
         keypoints.append(BoardKeypoint(designs[patch_id], x_mm, y_mm, rotate_deg, diameter_mm))
     side_x_mm, side_y_mm = table.numbers("side_mm", 0.1, LARGEST_MM, 2)
     references = tuple(map(_parse_mark, _tables(table, "references"))) if "references" in table else ()
-    return Board(table.name(), side_x_mm, side_y_mm, tuple(keypoints), references)
+    is_field = "field" in table and table.flag("field")
+    return Board(table.name(), side_x_mm, side_y_mm, tuple(keypoints), references, is_field)
 
 
 def _parse_mark(entry: TomlTable) -> ReferenceMark:

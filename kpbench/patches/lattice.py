@@ -8,14 +8,13 @@ number of letters in which two words differ (the Hamming distance).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from kpbench.types import Float, Int
 
 WINDOW = (3, 3)
-LEAST_PLACES = 21
-"""A smaller board is not decoded as a field. Some small grids of a regular pattern have different windows, too."""
 EVEN_MM = 1e-3
 """Lengths that differ by less are the same."""
 WORDS_AT_ONCE = 2**24
@@ -39,6 +38,12 @@ class Lattice:
     ids: Int
     points: Int
     pitch: float
+
+    @cached_property
+    def alphabet(self) -> tuple[Int, Int]:
+        """The different IDs, in rising order, and the number of the ID in each row and column, shape (R, C)."""
+        ids, letter = np.unique(self.ids, return_inverse=True)
+        return ids, letter.reshape(self.ids.shape)
 
 
 def window_words(letters: Int, window: tuple[int, int] = WINDOW) -> Int:
@@ -102,7 +107,7 @@ def field_distance(letters: Int, window: tuple[int, int] = WINDOW) -> int:
 
 
 def find_lattice(points_mm: Float, ids: Int, rotate_deg: Float, diameter_mm: Float) -> Lattice | None:
-    """Return the lattice of a board, or None if the board is no field.
+    """Return the lattice of a board, or None if its patches are no field.
 
     Parameters
     ----------
@@ -115,7 +120,7 @@ def find_lattice(points_mm: Float, ids: Int, rotate_deg: Float, diameter_mm: Flo
     """
     x, column = np.unique(points_mm[:, 0].round(3), return_inverse=True)
     y, row = np.unique(points_mm[:, 1].round(3), return_inverse=True)
-    if len(ids) < LEAST_PLACES or len(x) * len(y) != len(ids) or min(len(x), len(y)) < WINDOW[0]:
+    if len(x) * len(y) != len(ids) or min(len(x), len(y)) < WINDOW[0]:
         return None
     steps = np.concatenate([np.diff(x), np.diff(y)])
     if max(np.ptp(steps), np.ptp(diameter_mm), np.ptp(rotate_deg), abs(rotate_deg[0])) > 2 * EVEN_MM:

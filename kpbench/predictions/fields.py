@@ -23,7 +23,7 @@ MATRIX_CELLS = {
 """Columns of CSV and Parquet for each matrix of a detection, by row. A covariance is symmetric."""
 DETECTION_CELLS = (
     *("x", "y", "score", "id", *MATRIX_CELLS["A_patch2image"], *MATRIX_CELLS["covariance"]),
-    *("blur_px", "board", "points"),
+    *("blur_px", "board", "points", "probability"),
 )
 IMAGE_CELLS = ("file", "width", "height", "frame_index", "time_s", "ms")
 TABLE_COLUMNS = ("image_id", *DETECTION_CELLS, *IMAGE_CELLS)
@@ -39,6 +39,7 @@ H5_COLUMNS = {
     "blur_px": ("fiu", 1),
     "board": ("iu", 1),
     "points": ("iu", 1),
+    "probability": ("fiu", 1),
     "file": ("S", 1),
     "size": ("iu", 2),
     "frame_index": ("iu", 1),
@@ -64,6 +65,7 @@ class ImageRecord(msgspec.Struct, gc=False, forbid_unknown_fields=True):
     blur_px: list[float] | None = None
     board: list[Int64] | None = None
     points: list[Int64] | None = None
+    probability: list[float] | None = None
     file: str | None = None
     size: tuple[Side, Side] | None = None
     frame_index: Whole64 | None = None
@@ -90,6 +92,8 @@ EXPECTED_IN_RECORD = {
     "ms": "milliseconds, a finite number of 0 or more",
     "points": "a list",
     "points[]": "the index of a board's point, or -1",
+    "probability": "a list",
+    "probability[]": "a number from 0 to 1",
     "scores": "a list",
     "scores[]": "a finite number",
     "size": "width and height in px, whole numbers over 0",

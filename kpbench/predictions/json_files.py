@@ -103,6 +103,7 @@ def read_jsonl(path: Path) -> Predictions:
 
 
 LISTS = {"scores": 1, "ids": 1, "A_patch2image": 3, "covariance": 3, "blur_px": 1, "board": 1, "points": 1}
+LISTS |= {"probability": 1}
 """Optional lists of a record with an entry per keypoint, and their depth."""
 WHOLE_LISTS = ("ids", "board", "points")
 IMAGE_DTYPES: dict[str, Any] = {"file": object, "size": "i8", "frame_index": "i8", "time_s": "f8", "ms": "f8"}

@@ -75,6 +75,7 @@ def build_predictions(table: dict[str, NDArray[Any]], header: dict[str, Any], pl
             blur_px=table["blur_px"][rows] if "blur_px" in table else None,
             board=table["board"][rows] if "board" in table else None,
             points=table["points"][rows] if "points" in table else None,
+            probability=table["probability"][rows] if "probability" in table else None,
             A_patch2image=_matrices(table, "A_patch2image", rows),
             covariance=_matrices(table, "covariance", rows),
             **_columns_of_images(table, image, place),
@@ -148,7 +149,8 @@ def make_table(predictions: Predictions) -> dict[str, NDArray[Any]]:
         if matrices is not None:
             places = (0, 1, 3) if len(names) == 3 else range(4)
             cells |= {cell: matrices.reshape(-1, 4)[:, k] for cell, k in zip(names, places, strict=True)}
-    for name, values in (cells | {"blur_px": p.blur_px, "board": p.board, "points": p.points}).items():
+    cells |= {name: getattr(p, name) for name in ("blur_px", "board", "points", "probability")}
+    for name, values in cells.items():
         if values is not None:
             columns[name] = np.full(len(image), np.nan)
             columns[name][~blank] = values

@@ -169,6 +169,7 @@ def board_sheet(board: Board, page_format: PageFormat, tile: bool = False) -> Sh
         "frame": "mm; x right, y down, z away from the viewer; the origin is the board's centre",
         "side_mm": [round_to_nm(board.side_x_mm), round_to_nm(board.side_y_mm)],
         "unique_pose": not pose_problem(board),
+        "field": board.is_field,
         "keypoints": keypoints,
         "tiles": [_tile_entry(t, n, page_format) for n, t in enumerate(tiles, 1)],
     }

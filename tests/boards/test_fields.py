@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kpbench import Detections, Predictions, estimate_pose, field_board, find_board, shipped_patches
-from kpbench.boards import locate_boards
+from kpbench import Detections, Predictions, estimate_pose, field_board, field_boards, find_board, shipped_patches
+from kpbench.boards import find_boards, locate_boards
 from kpbench.geometry import Camera
 
 path = Path(__file__).parents[2] / "benchmarks" / "accuracy" / "fields.py"
@@ -89,6 +89,13 @@ def test_few_patches_are_not_sure():
     assert find_board(Detections.none(), BOARD) == ()
 
 
+def test_patches_on_a_diagonal_make_a_lattice():
+    """Points on a line do not tell a homography: the frames must."""
+    rows = np.array([LARGE.lattice.points[k, k] for k in range(12)])
+    [match] = find_board(flat(LARGE)[rows], LARGE)
+    assert match.points.tolist() == rows.tolist()
+
+
 def test_half_turned_checkers_are_brought_into_the_orientation_of_the_board():
     found = flat(BOARD)
     A = np.where((found.patch_id == 0)[:, None, None], -found.A_patch2image, found.A_patch2image)
@@ -125,6 +132,46 @@ def test_two_copies_are_two_matches():
     assert [match.points.tolist() for match in matches] == [list(range(70))] * 2
     located, _ = locate_boards(Predictions.from_detections([both]), [BOARD])
     assert located.points.tolist() == [*range(70), *range(70)]
+    assert (located.probability > 0.999).all()
+    few = flat(BOARD)[rows_of(BOARD, 0, 0, 2, 2)]
+    unsure = Detections([*few.xy, [5000, 5000]], np.ones(5), [*few.patch_id, 0], [*few.A_patch2image, np.eye(2)])
+    located, _ = locate_boards(Predictions.from_detections([unsure]), [BOARD])
+    assert located.points.tolist() == [-1] * 5
+    assert located.probability[4] == 0 < located.probability[0] < 0.999
+
+
+def test_any_window_tells_which_of_many_fields_it_is():
+    boards = field_boards(shipped_patches(), 32)
+    for n, top, left in ((0, 0, 0), (11, 4, 2), (31, 6, 3)):
+        rows = rows_of(boards[n], top, left, 4, 4)
+        found = flat(boards[n])[rows]
+        matches = find_boards(found, boards)
+        assert [len(match) for match in matches] == [int(k == n) for k in range(32)]
+        assert matches[n][0].points.tolist() == rows.tolist()
+        assert not matches[n][0].ambiguous
+        small = [
+            match
+            for matches in find_boards(flat(boards[n])[rows_of(boards[n], top, left, 3, 3)], boards)
+            for match in matches
+        ]
+        assert [match.board for match in small] == [boards[n]]
+        assert 0.9 < small[0].probability < 0.999, "nine letters leave some doubt among 32 boards"
+
+
+def test_a_field_takes_the_place_of_one_that_explains_the_letters_less_well():
+    """The letters of one board, but for two, on another board: alone it is sure, beside the right one it is not."""
+    right = field_board(shipped_patches(), 6, 6)
+    keypoints = [
+        replace(k, patch=shipped_patches()[(k.patch_id + (n in (7, 28))) % 4]) for n, k in enumerate(right.keypoints)
+    ]
+    near = replace(right, name="near", keypoints=tuple(keypoints))
+    found = flat(right)
+    [[alone], [match]] = find_board(found, near), find_board(found, right)
+    assert not alone.ambiguous
+    for boards in ([near, right], [right, near]):
+        [both] = [match for matches in find_boards(found, boards) for match in matches]
+        assert both.board is right
+        assert match.probability > both.probability > 0.99
 
 
 def test_the_pose_follows():

@@ -94,9 +94,23 @@ def test_measured_corrects_what_was_printed_and_renders_nothing():
     assert load("patches-print/patches.json")["print_scale"] == [1, 1]
 
 
+def test_several_fields_are_printed_and_told_from_each_other(here):
+    kpbench("render-patches", "--board", "field", "--fields", 2, "--rows", 5, "--columns", 5, "--svg")
+    assert [path.name for path in sorted(Path("patches-print").glob("*.json"))] == [
+        "field-5x5-1.json",
+        "field-5x5-2.json",
+    ]
+    refused = kpbench("render-patches", "--board", "grid", "--fields", 2, code=2).stderr
+    assert "--rows, --columns and --fields are for --board field" in refused
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (
+            ("--fields", 101, "--board", "field", "--rows", 5, "--columns", 5),
+            "there are 100 fields of 5 rows and 5 col",
+        ),
         (("--diameter-mm", 300), r"the largest diameter that fits is 180 mm"),
         (("--page", "b5"), "--page is 'b5', expected a4"),
         (("--patch", "nobody"), "patch 'nobody' is not known; known are: "),

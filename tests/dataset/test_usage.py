@@ -4,6 +4,7 @@ import importlib.util
 import re
 import shutil
 import subprocess
+import warnings
 
 import pytest
 
@@ -41,6 +42,7 @@ def test_the_lines_of_a_readme_run(folders, name, number, monkeypatch):
     for package in re.findall(r"^(?:import|from) (\w+)", code, re.MULTILINE):
         if importlib.util.find_spec(package) is None:
             pytest.skip(f"{package} is not installed")
+    warnings.simplefilter("ignore", DeprecationWarning)  # of the packages of others; pytest restores the filters
     exec(compile(code, f"{name}/README.md", "exec"), {"__name__": "__readme__"})
 
 

@@ -2,16 +2,18 @@
 
 import importlib.util
 import itertools
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from kpbench import field_board, grid_board, load_board, print_boards, shipped_patches
+from kpbench import field_board, field_boards, grid_board, load_board, print_boards, shipped_patches
 from kpbench.errors import DesignError
 from kpbench.files import shipped_folder
 from kpbench.patches import field_distance, shipped_field
 from kpbench.patches.field import SHIPPED_DISTANCES
+from kpbench.patches.lattice import window_words
 
 ROOT = Path(__file__).parents[2]
 spec = importlib.util.spec_from_file_location("search_fields", ROOT / "benchmarks" / "designs" / "search_fields.py")
@@ -87,6 +89,17 @@ def test_a_board_has_the_letters_of_the_best_field_that_is_large_enough(rows, co
     assert board.lattice.pitch == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize(
+    ("count", "rows", "columns", "least"), [(32, 10, 7, 2), (9, 5, 5, 3), (12, 5, 4, 3), (4, 5, 4, 4)]
+)
+def test_no_window_of_several_fields_is_near_one_of_another(count, rows, columns, least):
+    boards = field_boards(shipped_patches(), count, rows, columns)
+    assert len({board.name for board in boards}) == len({board.digest for board in boards}) == count
+    words = np.concatenate([window_words(board.lattice.ids) for board in boards]).astype(np.int8)
+    assert len(words) == 4 * count * (rows - 2) * (columns - 2)
+    assert min(int((words[n + 1 :] != words[n]).sum(axis=1).min()) for n in range(len(words) - 1)) >= least
+
+
 def test_a_printed_field_comes_back_from_its_sidecar(tmp_path):
     board = field_board(shipped_patches(), 12, 9, diameter_mm=20.0)
     files = print_boards([board], tmp_path, page="a4", tile=True)
@@ -95,9 +108,26 @@ def test_a_printed_field_comes_back_from_its_sidecar(tmp_path):
     assert np.array_equal(read.lattice.ids, board.lattice.ids)
 
 
+def test_a_board_is_found_as_a_field_if_it_says_so(tmp_path):
+    """Not for its windows alone: a grid with the letters of a field stays a grid."""
+    field = field_board(shipped_patches(), 3, 4)
+    assert field.lattice.ids.shape == (3, 4)
+    assert replace(field, is_field=False).lattice is None
+    lines = [f"{{ patch = {k.patch_id}, x_mm = {k.x_mm}, y_mm = {k.y_mm} }}" for k in field.keypoints]
+    text = f"diameter_mm = 16\nkeypoint = [{', '.join(lines)}]\n"
+    (tmp_path / "board.toml").write_text(text)
+    assert load_board(tmp_path / "board.toml").lattice is None
+    (tmp_path / "field.toml").write_text(f"field = true\n{text}")
+    assert np.array_equal(load_board(tmp_path / "field.toml").lattice.ids, field.lattice.ids)
+    print_boards([replace(field, is_field=False)], tmp_path, formats=[])
+    assert load_board(tmp_path / "field-3x4.json").lattice is None
+
+
 def test_a_regular_grid_is_no_field():
-    for rows, columns in [(4, 3), (4, 5), (8, 8)]:
-        assert grid_board(shipped_patches(), rows, columns, 20.0, 40.0).lattice is None
+    for rows, columns in [(8, 8), (2, 9)]:
+        board = grid_board(shipped_patches(), rows, columns, 20.0, 40.0)
+        with pytest.raises(DesignError, match="board 'grid' is no field: expected upright patches of one size on a"):
+            replace(board, is_field=True)
 
 
 def test_impossible_fields_are_refused():
@@ -107,5 +137,7 @@ def test_impossible_fields_are_refused():
         field_board(shipped_patches(), 2, 9)
     with pytest.raises(DesignError, match="60 rows and 9 columns is too large, expected at most 51 x 50"):
         field_board(shipped_patches(), 60, 9)
+    with pytest.raises(DesignError, match="there are 35 fields of 10 rows and 7 columns, expected at least 36"):
+        field_boards(shipped_patches(), 36)
     with pytest.raises(DesignError, match="`distance` is 7, expected one of 5, 4, 3, 2"):
         shipped_field(7)

@@ -13,7 +13,7 @@ from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.types import UNKNOWN, Detections, Predictions
 
 FORMATS = ["json", "jsonl", "csv", "parquet", "h5"]
-OF_DETECTIONS = ("A_patch2image", "covariance", "blur_px", "board", "points")
+OF_DETECTIONS = ("A_patch2image", "covariance", "blur_px", "board", "points", "probability")
 HEADER = {"schema": "kpbench.predictions/2", "boards": ["hexagon-chécker", "b"]}
 
 
@@ -29,6 +29,7 @@ def some(n=12, seed=0, **change):
         "blur_px": rng.random(k),
         "board": np.where(np.arange(k) % 4 == 1, -1, 1),
         "points": np.where(np.arange(k) % 4, -1, np.arange(k)),
+        "probability": rng.random(k),
         "boards": ("hexagon-chécker", "b"),
         "file": tuple(f"ünï,{i}: a.png" if i % 3 else "" for i in range(n)),
         "size": np.where(np.arange(n)[:, None] == 1, 0, rng.integers(1, 5000, (n, 2))),
@@ -197,6 +198,14 @@ def test_an_impossible_cell_is_one_line(tmp_path, columns, cells, problem):
     assert str(error.value).startswith(f"{path}: {problem}")
 
 
+def test_a_probability_lies_between_0_and_1(tmp_path):
+    header = HEADER | {"boards": ["a"]}
+    record = {"image_id": 12, "keypoints": [[1, 2]], "board": [0], "points": [3], "probability": [1.5]}
+    (tmp_path / "p.json").write_text(json.dumps(header | {"predictions": [record]}))
+    with pytest.raises(PredictionsError, match=r"probability\[0\] is 1\.5, expected a number from 0 to 1"):
+        read_predictions(tmp_path / "p.json")
+
+
 @pytest.mark.parametrize(
     ("name", "values", "problem"),
     [
@@ -204,6 +213,7 @@ def test_an_impossible_cell_is_one_line(tmp_path, columns, cells, problem):
         ("covariance", np.ones((3, 4)), "/covariance is float64 of shape (3, 4), expected numbers"),
         ("covariance", np.ones((3, 2, 3)), "/covariance has shape (3, 2, 3), expected (K, 2, 2)"),
         ("blur_px", np.ones(2), "blur_px has shape (2,), expected (3,)"),
+        ("probability", np.ones(3), "probability is given without board and points"),
         ("size", np.ones((1, 2)), "/size is float64 of shape (1, 2), expected numbers"),
         ("file", np.array([b"\xff"]), "/file holds a name that is not UTF-8 text"),
         ("file", np.array([b"a", b"b"]), "1 images have 2 file names, expected one per image"),

@@ -15,6 +15,7 @@ from kpbench.errors import DataError, DesignError
 from kpbench.geometry.outline import flatten
 from kpbench.patches.board import Board, BoardKeypoint, grid_board, hexagon_board
 from kpbench.patches.design import parse_patch, shipped_patches
+from kpbench.patches.field import field_board
 from kpbench.printing.dxf import to_dxf
 from kpbench.printing.formats import PAGE_WRITERS
 from kpbench.printing.page import CUT, INK, MARKS
@@ -61,6 +62,8 @@ SHEETS = {
     "mirrored": board_sheet(MIXED, PageFormat(210, 297, mirrored=True)),
     "bare": patch_sheet(PATCHES, 30, PageFormat(210, 297, labels=False)),
     "tiled": board_sheet(hexagon_board(RIMMED, 350), A4, tile=True),
+    "field": board_sheet(field_board(PATCHES[:4]), A4),
+    "tiled-field": board_sheet(field_board(PATCHES[:4], 12, 9, 20.0), A4, tile=True),
     **{f"hexagon-{p.patch_id}": board_sheet(hexagon_board(p, 187.5), A4) for p in PATCHES},
 }
 

@@ -1,0 +1,5 @@
+"""Compare two datasets, or two versions of one: config, truth, pixels and distributions."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
