@@ -12,8 +12,9 @@ from kpbench.degrade.effects import (
     low_light,
     noise,
     occlusion,
-    occlusion_cover,
+    polygon_cover,
     shadow_edge,
+    strip_corners,
 )
 from kpbench.degrade.ladder import EFFECT_FUNCTIONS, LADDER, apply_effects, draw_effect
 from kpbench.errors import DataError
@@ -161,7 +162,7 @@ def test_a_shadow_edge_takes_its_share_of_light_on_one_side():
 def test_occlusion_hides_the_share_it_says(level):
     discs = np.array([[50.3, 60.1, 20.0], [130.0, 60.0, 12.5]])
     recorded = draw_effect(np.random.default_rng(0), "occlusion", level, (180, 120), discs)
-    cover = occlusion_cover(recorded["strips"], (0, 0, 180, 120))
+    cover = polygon_cover(strip_corners(recorded["strips"]), (0, 0, 180, 120))
     angles = np.radians(np.arange(360))
     for x, y, radius in discs:
         rim = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
@@ -169,7 +170,7 @@ def test_occlusion_hides_the_share_it_says(level):
         assert np.isclose((disc * cover).sum() / disc.sum(), level / 100, atol=0.01)
     image = np.full((120, 180), 255, np.uint8)
     assert ((occlusion(image, recorded["strips"]) < 255) == (cover > 1 / 255)).mean() > 0.999
-    part = occlusion_cover(recorded["strips"], (40, 30, 50, 60))
+    part = polygon_cover(strip_corners(recorded["strips"]), (40, 30, 50, 60))
     assert np.allclose(part, cover[30:90, 40:90])
 
 
