@@ -20,15 +20,28 @@ from kpbench.images import to_grey
 from kpbench.patches.tag_boards import charuco_pattern, tag_dictionary
 from kpbench.types import Detections, Float, UInt8
 
-ARUCO_SETTINGS: dict[str, Any] = {"cornerRefinementMethod": cv2.aruco.CORNER_REFINE_APRILTAG}
+ARUCO_SETTINGS: dict[str, Any] = {
+    "cornerRefinementMethod": cv2.aruco.CORNER_REFINE_APRILTAG,
+    "aprilTagQuadDecimate": 1.5,
+    "aprilTagQuadSigma": 0.8,
+    "perspectiveRemoveIgnoredMarginPerCell": 0.25,
+    "maxErroneousBitsInBorderRate": 0.5,
+}
 """Fields of OpenCV's ``DetectorParameters`` for the board ``aruco``, where they differ from OpenCV's defaults."""
 CHARUCO_SETTINGS: dict[str, Any] = {"tryRefineMarkers": True}
 """Fields of OpenCV's ``CharucoParameters`` and ``DetectorParameters`` for the board ``charuco``, in the same way."""
-APRILTAG_SETTINGS: dict[str, Any] = {"decimate": 1.5}
+APRILTAG_SETTINGS: dict[str, Any] = {"decimate": 1.5, "blur": 0.8, "maxhamming": 2}
 """Arguments of the AprilTag library, where they differ from the library's defaults."""
-NAPA_SETTINGS: dict[str, Any] = {"min_tag_px": 16}
+NAPA_SETTINGS: dict[str, Any] = {"min_tag_px": 24, "min_contrast": 5}
 """Arguments of ``napa_vision.NapaDetector``, in the same way."""
-LOCUS_SETTINGS: dict[str, Any] = {"profile": "standard"}
+LOCUS_SETTINGS: dict[str, Any] = {
+    "profile": "standard",
+    "threshold.mode": "LocalMean",
+    "threshold.noise_k": 3.0,
+    "threshold.enable_sharpening": False,
+    "decoder.max_hamming_error": 1,
+    "segmentation.connectivity": "Eight",
+}
 """Settings of ``locus``: its profile, ``decimation``, and fields of its groups as ``GROUP.FIELD``."""
 LEAST_APRILTAG_SIDE_PX = 8
 """The shorter side of an image must have at least this many px. A smaller image has no detections, as the library

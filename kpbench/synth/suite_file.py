@@ -163,7 +163,7 @@ def shipped_suites() -> dict[str, Path]:
     --------
     >>> from kpbench.synth import shipped_suites
     >>> list(shipped_suites())
-    ['camera-v1', 'extended-v1', 'paper-v1', 'video-v1']
+    ['camera-v1', 'extended-v1', 'extended-v2', 'paper-v1', 'video-v1']
     """
     return shipped_files("suites")
 
