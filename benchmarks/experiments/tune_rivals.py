@@ -1,13 +1,13 @@
 """The best operating point of each rival: the settings of the detectors of tags that kpbench ships.
 
-    python benchmarks/experiments/tune_rivals.py                     # all rivals; needs the extras apriltag, napa, locus
+    python benchmarks/experiments/tune_rivals.py                  # all rivals; needs the extras apriltag, napa, locus
     python benchmarks/experiments/tune_rivals.py --rival napa --images 3
 
 Rule. The scenes are those of `paper-v1` and `extended-v1` at 640x480, four of seed 1, which no published table uses.
 The merit of a setting is the share of corners found with the right identity, less the false alarms per corner: a false
 alarm costs as much as a corner brings. Each image counts alike. The search starts at the library's defaults, takes the
 axes below in turn, keeps a value that adds more than 0.001, and ends after a round without a change. Among the starts
-of one rival, the best ends wins.
+of a rival, the best end wins.
 """
 
 from __future__ import annotations

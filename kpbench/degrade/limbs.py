@@ -6,6 +6,8 @@ in widths of the board, which is 12.5 radii of a patch on the boards of the suit
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from kpbench.degrade.effects import Effect, paint_polygons
@@ -113,6 +115,6 @@ def draw_cable(rng: np.random.Generator, level: float, size_px: tuple[int, int],
         t = np.linspace(0, 1, CABLE_PIECES + 1)[:, None]
         start, control, end = -along + ends[0] * across, bend * across, along + ends[1] * across
         points = middle + (1 - t) ** 2 * start + 2 * t * (1 - t) * control + t**2 * end
-        for a, b in zip(points[:-1], points[1:], strict=True):
+        for a, b in pairwise(points):
             parts += _limb(a, b, (radius, radius), grey)
     return {"effect": "limbs", "limbs": parts}

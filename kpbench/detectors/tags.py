@@ -18,7 +18,7 @@ import numpy as np
 from kpbench.errors import DataError
 from kpbench.images import to_grey
 from kpbench.patches.tag_boards import charuco_pattern, tag_dictionary
-from kpbench.types import Detections, Float, UInt8
+from kpbench.types import Detections, UInt8
 
 ARUCO_SETTINGS: dict[str, Any] = {
     "cornerRefinementMethod": cv2.aruco.CORNER_REFINE_APRILTAG,
@@ -28,7 +28,14 @@ ARUCO_SETTINGS: dict[str, Any] = {
     "maxErroneousBitsInBorderRate": 0.5,
 }
 """Fields of OpenCV's ``DetectorParameters`` for the board ``aruco``, where they differ from OpenCV's defaults."""
-CHARUCO_SETTINGS: dict[str, Any] = {"tryRefineMarkers": True}
+CHARUCO_SETTINGS: dict[str, Any] = {
+    "tryRefineMarkers": True,
+    "minMarkers": 1,
+    "adaptiveThreshWinSizeMax": 43,
+    "adaptiveThreshWinSizeStep": 8,
+    "adaptiveThreshConstant": 3,
+    "maxErroneousBitsInBorderRate": 0.5,
+}
 """Fields of OpenCV's ``CharucoParameters`` and ``DetectorParameters`` for the board ``charuco``, in the same way."""
 APRILTAG_SETTINGS: dict[str, Any] = {"decimate": 1.5, "blur": 0.8, "maxhamming": 2}
 """Arguments of the AprilTag library, where they differ from the library's defaults."""
@@ -57,7 +64,7 @@ def _opencv_parameters(settings: Mapping[str, Any], *objects: Any) -> None:
         setattr(next(o for o in objects if hasattr(o, name)), name, value)
 
 
-def _corners_of(ids: Any, corners: Float, score: Any) -> Detections:
+def _corners_of(ids: Any, corners: Any, score: Any) -> Detections:
     """Return four detections a tag, from the tags' IDs (n,), corners (n, 4, 2) and scores (n,)."""
     corner_ids = 4 * np.asarray(ids, np.int64).reshape(-1, 1) + np.arange(4)
     return Detections(np.asarray(corners, np.float64).reshape(-1, 2), np.repeat(score, 4), corner_ids.ravel())

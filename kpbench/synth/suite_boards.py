@@ -73,7 +73,7 @@ def printed_share(board: BoardLike) -> float:
         if board.name != "charuco":
             modules = TAGS_PER_BOARD * ((len(board.black) - 1) / TAGS_PER_BOARD - 1) ** 2
         return modules / len(board.black) ** 2 / len(board.keypoints)
-    area_mm2 = sum(np.pi / 4 * k.diameter_mm**2 for k in board.keypoints)
+    area_mm2 = sum(np.pi * k.H_patch2board[0, 0] ** 2 for k in board.keypoints)
     return float(area_mm2 / (board.side_x_mm * board.side_y_mm) / len(board.keypoints))
 
 
