@@ -1,7 +1,7 @@
 """The leaderboard, its figure and the table of the findings from the scores in benchmarks/results.
 
     python benchmarks/publish/leaderboard.py                        # writes three files of docs/results
-    python benchmarks/publish/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
+    python benchmarks/publish/leaderboard.py --take kpbench-bench --verified verified.json   # first copy these scores
 
 The table of the findings and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another
 size or over photographs are kept apart.
@@ -11,6 +11,7 @@ Of a scores file only what the tables need is kept: all images, and every condit
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ from kpbench.scoring import LABELS
 ROOT = Path(__file__).parents[2]
 RESULTS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs" / "results"
 PAGE, FINDINGS, FIGURE = DOCS / "leaderboard.md", DOCS / "findings.md", DOCS / "severity.svg"
-ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
+ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "napa", "locus", "aruco", "charuco", "sift", "orb")
 SHOWN_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
 QUICK_PX = (640, 480)
@@ -48,19 +49,24 @@ All images are **simulated**. Brackets hold 95 % intervals from resampled scenes
 each table. What boards of tags are, and how far they compare with patches:
 [patches against tags](../explanation/fairness-to-tags.md).
 
-To enter a detector: run the command below a heading with `--detector` yours, then
-`python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
-`benchmarks/results`. It names the dataset by its fingerprint, and whoever has the detector gets the same numbers from
-the same command.
+To enter a detector: run the command below a heading with `--detector` yours, and send the folders `scores` and
+`predictions` of `kpbench-bench`. `kpbench leaderboard verify kpbench-bench --json verified.json` makes the images anew,
+and runs the detector again on a random 2 % of them. `python benchmarks/publish/leaderboard.py --take kpbench-bench
+--verified verified.json` puts the scores into `benchmarks/results`. The column *verified* says on how many images the
+rerun found the same; *no* means that nobody has rerun the detector.
 
 The scores were made with version 1 of the pixels and version 7 of the verification. What has changed since
 then, and how little it moved on 250 images, stands at the head of the [findings](findings.md).
 """
 
 
-def take(folder: Path) -> None:
+def take(folder: Path, verified: Path | None) -> None:
+    """Copy scores, and into them on how many images a rerun of the detector found the same."""
+    entries = json.loads(verified.read_text())["results"] if verified else []
+    images = {entry["scores_sha256"]: entry["images"] for entry in entries if not entry["problem"]}
     for path in sorted(folder.glob("scores/*/*.json")):
         scores = json.loads(path.read_text())
+        scores["verified_images"] = images.get(hashlib.sha256(path.read_bytes()).hexdigest(), 0)
         scores["by"] = [group for group in scores["by"] if group["patch_id"] is None and group["radius_px"] is None]
         for key in ("confusion", "curve"):
             del scores[key]
@@ -105,8 +111,15 @@ def overall(runs: list[dict[str, Any]]) -> Table:
         board = run["provenance"]["config"].get("board", {"name": "patches"})["name"]
         images = run["metrics"]["counts"]["images"]
         about = (run["detector"]["name"], run["detector"]["version"], board, images)
-        rows.append((*about, *(estimate(run["metrics"], name) for name in SHOWN_METRICS)))
-    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in SHOWN_METRICS))
+        verified = run.get("verified_images")
+        rows.append(
+            (
+                *about,
+                *(estimate(run["metrics"], name) for name in SHOWN_METRICS),
+                f"on {verified} images" if verified else "no",
+            )
+        )
+    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in SHOWN_METRICS), "verified")
     return Table("All conditions", columns, tuple(rows))
 
 
@@ -213,9 +226,12 @@ def page(results: Path) -> tuple[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--take", type=Path, metavar="FOLDER", help="copy the scores of a `kpbench bench` folder first")
-    folder = parser.parse_args().take
-    if folder:
-        take(folder)
+    parser.add_argument(
+        "--verified", type=Path, metavar="FILE", help="of `kpbench leaderboard verify FOLDER --json FILE`"
+    )
+    options = parser.parse_args()
+    if options.take:
+        take(options.take, options.verified)
     text, picture = page(RESULTS)
     FINDINGS.write_text(findings(FINDINGS.read_text(), load(RESULTS / "paper-v1")))
     PAGE.write_text(text)

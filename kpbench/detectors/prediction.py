@@ -6,7 +6,7 @@ import contextlib
 import math
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -287,7 +287,7 @@ def detect_images(
     dataset: Dataset | CocoDataset,
     detector: str | LoadedDetector,
     threshold: float | None,
-    positions: range,
+    positions: Sequence[int],
     progress: Progress,
 ) -> dict[int, ImageResult]:
     """Run a detector over some images of a dataset.
@@ -296,7 +296,7 @@ def detect_images(
 
     Parameters
     ----------
-    positions : range
+    positions : sequence of int
         Positions of the images in the dataset.
 
     Returns
