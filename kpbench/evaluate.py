@@ -15,7 +15,7 @@ from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite
 from kpbench.predictions.files import read_predictions
 from kpbench.provenance import image_source
-from kpbench.report.report import Report, require_report_suffix, write_report
+from kpbench.report.report import Report, name_runs, require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
     encode_comparisons,
@@ -113,6 +113,7 @@ def score_file(
     csv_file: str | Path | None = None,
     images_csv_file: str | Path | None = None,
     report_file: str | Path | None = None,
+    names: Sequence[str] = (),
     command: Sequence[str] = (),
     warn: Callable[[str], None] = warnings.warn,
     **options: Unpack[ScoreOptions],
@@ -130,7 +131,9 @@ def score_file(
         Whether to compute errors of the board's pose also. The dataset must be made from a suite.
     json_file, csv_file, images_csv_file, report_file : str, Path or None
         Files to write: all scores as JSON, one row per group as CSV, one row per image as CSV, and a report (.html, .md
-        or .tex).
+        or .tex; severity curves as .pdf, .png or .svg).
+    names : sequence of str
+        Name of the detector in the report. Empty: the name in the predictions, without version.
     command : sequence of str
         The command line, for the provenance.
     warn : function
@@ -170,7 +173,7 @@ def score_file(
     if to_images:
         write_file(to_images, encode_images_csv(scores))
     if to_report:
-        _write_report(to_report, [scores], dataset, provenance, warn, poses=poses)
+        _write_report(to_report, name_runs([scores], names), dataset, provenance, warn, poses=poses)
     return ScoredFile(scores, dataset, poses, provenance)
 
 
@@ -180,6 +183,7 @@ def compare_files(
     *,
     json_file: str | Path | None = None,
     report_file: str | Path | None = None,
+    names: Sequence[str] = (),
     command: Sequence[str] = (),
     warn: Callable[[str], None] = warnings.warn,
     **options: Unpack[ScoreOptions],
@@ -193,7 +197,11 @@ def compare_files(
     truth, command, warn, **options
         As for :func:`score_file`. None as `truth` takes the dataset that the first file names.
     json_file, report_file : str, Path or None
-        Files to write: all differences as JSON, and a report (.html, .md or .tex).
+        Files to write: all differences as JSON, and a report (.html, .md or .tex; severity curves as .pdf, .png or
+        .svg).
+    names : sequence of str
+        Names of the detectors, one per file. Empty: the names in the predictions; detectors that share a name are told
+        apart by version and file.
 
     Returns
     -------
@@ -218,6 +226,7 @@ def compare_files(
     paths, to_json, to_report = [Path(file) for file in predictions], _as_path(json_file), _as_path(report_file)
     _refuse_overwrite(paths, {"comparison": to_json, "report": to_report})
     dataset, scores = _score_files(paths, truth, warn, options)
+    scores = name_runs(scores, names)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
     provenance = collect_provenance(dataset, paths, command)
     if to_json:

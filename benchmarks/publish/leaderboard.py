@@ -1,6 +1,6 @@
-"""The leaderboard, its figure and the table of the findings from the scores in benchmarks/results.
+"""The leaderboard, its figures and the table of the findings from the scores in benchmarks/results.
 
-    python benchmarks/publish/leaderboard.py                        # writes three files of docs/results
+    python benchmarks/publish/leaderboard.py                        # writes four files of docs/results
     python benchmarks/publish/leaderboard.py --take kpbench-bench --verified verified.json   # first copy these scores
 
 The table of the findings and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another
@@ -19,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.report import (
-    CHART_COLOURS,
-    CHART_STYLE,
     PAPER,
     Cell,
     Estimate,
+    Panel,
     Series,
     Table,
-    line_chart,
+    draw_panels,
     to_markdown,
 )
 from kpbench.scoring import LABELS
@@ -39,7 +38,6 @@ SHOWN_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", 
 PAPER_STYLE = 7
 QUICK_PX = (640, 480)
 """The size of `kpbench bench --quick`."""
-PANEL = (480, 300)
 
 HEAD = """\
 # Leaderboard
@@ -165,8 +163,8 @@ def crossing(run: dict[str, Any], condition: str) -> str:
     return "; ".join(b["crossing"] + (f" at {b['rung']:.3g}" if b["rung"] is not None else "") for b in found)
 
 
-def figure(runs: list[dict[str, Any]]) -> str:
-    """Detection score over the paper's five conditions, and whose line is whose."""
+def figure(runs: list[dict[str, Any]]) -> list[Panel]:
+    """Detection score over the paper's five conditions."""
     panels = []
     for table in PAPER.values():
         series = []
@@ -174,41 +172,22 @@ def figure(runs: list[dict[str, Any]]) -> str:
             found = [(rung, estimate(metrics, "detection_score")) for rung, metrics in rungs(run, table.condition)]
             x, y = [rung for rung, _ in found], [e.value for _, e in found]
             series.append(Series(run["detector"]["name"], x, y, [e.interval for _, e in found], n + (n >= PAPER_STYLE)))
-        paper = Series("paper", table.rungs, table.detection_score, style=PAPER_STYLE, dashed=True)
-        unit = f" ({table.unit})" if table.unit else ""
-        label, log = f"{table.title}{unit}", table.condition == "scale"
-        panels.append(
-            line_chart([*series, paper], label, "detection score", y_range=(0, 1), x_ticks=table.rungs, log_x=log)
-        )
-    names = [*((n + (n >= PAPER_STYLE), run["detector"]["name"]) for n, run in enumerate(runs))]
-    names.append((PAPER_STYLE, "the paper, photographs (dashed); all others: simulated"))
-    legend = "".join(
-        f'<circle class="s{style % CHART_COLOURS}" cx="60" cy="{30 + 26 * row}" r="6"/>'
-        f'<text x="78" y="{34 + 26 * row}">{name}</text>'
-        for row, (style, name) in enumerate(names)
-    )
-    inside = [re.sub(r"^<svg[^>]*>|</svg>$", "", panel) for panel in panels] + [legend]
-    width, height = 2 * PANEL[0], 3 * PANEL[1]
-    cells = "".join(
-        f'<g class="chart" transform="translate({n % 2 * PANEL[0]} {n // 2 * PANEL[1]})">{part}</g>'
-        for n, part in enumerate(inside)
-    )
-    own = ":root{color:#1c1e21;font:12px system-ui,sans-serif}@media (prefers-color-scheme:dark){:root{color:#e6e8eb}}"
-    about = "Detection score over severity, simulated, beside the paper's photographs"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{about}" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}"><style>{own}{CHART_STYLE}</style>{cells}</svg>\n'
-    )
+        name = "the paper, photographs (all others: simulated)"
+        paper = Series(name, table.rungs, table.detection_score, style=PAPER_STYLE, dashed=True)
+        label = f"{table.title} ({table.unit})" if table.unit else table.title
+        is_log = table.condition == "scale"
+        panels.append(Panel((*series, paper), label, "detection score", (0, 1), table.rungs, is_log))
+    return panels
 
 
-def page(results: Path) -> tuple[str, str]:
-    """The page as Markdown, and its figure as SVG."""
-    parts, picture = [HEAD], ""
+def page(results: Path) -> tuple[str, list[Panel]]:
+    """The page as Markdown, and the panels of its figure."""
+    parts, picture = [HEAD], list[Panel]()
     for suite in sorted(results.iterdir(), reverse=True):
         runs = load(suite)
         config = runs[0]["provenance"]["config"]
         if suite.name == "paper-v1":
-            parts.append("![Detection score over severity](severity.svg)\n")
+            parts.append("![Detection score over severity](severity.svg)\n\nAlso as [PDF](severity.pdf).\n")
             picture = figure(runs)
         size = "x".join(map(str, config["size_px"]))
         command = f"kpbench bench --suite {config['suite']} --images {config['images']} --size {size}"
@@ -235,7 +214,8 @@ def main() -> None:
     text, picture = page(RESULTS)
     FINDINGS.write_text(findings(FINDINGS.read_text(), load(RESULTS / "paper-v1")))
     PAGE.write_text(text)
-    FIGURE.write_text(picture)
+    for suffix in (".svg", ".pdf"):
+        FIGURE.with_suffix(suffix).write_bytes(draw_panels(picture, suffix))
 
 
 if __name__ == "__main__":

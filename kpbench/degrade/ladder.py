@@ -21,7 +21,7 @@ from kpbench.degrade.effects import (
     shadow_edge,
     strip_corners,
 )
-from kpbench.degrade.limbs import draw_cable, draw_hand, limb_outlines, limbs
+from kpbench.degrade.occluders import draw_cable, draw_hand, limb_outlines, limbs
 from kpbench.degrade.weather import rain, rainfall, shadow
 from kpbench.errors import DataError
 from kpbench.portable import arctan2, cos_sin_of

@@ -1,8 +1,11 @@
 from .charts import CHART_COLOURS as CHART_COLOURS
 from .charts import CHART_STYLE as CHART_STYLE
+from .charts import Panel as Panel
 from .charts import Series as Series
 from .charts import bar_chart as bar_chart
 from .charts import line_chart as line_chart
+from .figures import draw_panels as draw_panels
+from .latex import to_latex as to_latex
 from .paper import PAPER as PAPER
 from .paper import PaperTable as PaperTable
 from .paper import paper_value as paper_value
@@ -10,6 +13,7 @@ from .report import Report as Report
 from .report import write_report as write_report
 from .score_charts import Figure as Figure
 from .score_charts import severity_chart as severity_chart
+from .score_charts import severity_panel as severity_panel
 from .score_tables import bias_table as bias_table
 from .score_tables import breakpoint_table as breakpoint_table
 from .score_tables import difference_table as difference_table
@@ -23,7 +27,6 @@ from .summary import summarise_scores as summarise_scores
 from .tables import Cell as Cell
 from .tables import Estimate as Estimate
 from .tables import Table as Table
-from .tables import to_latex as to_latex
 from .tables import to_markdown as to_markdown
 from .tables import to_plain as to_plain
 from .worst_cases import Case as Case

@@ -16,6 +16,8 @@ from kpbench.errors import DataError
 from kpbench.files import encode_utf8
 from kpbench.provenance import UNKNOWN_SOURCE, describe_images, image_source
 from kpbench.report.charts import CHART_COLOURS, CHART_STYLE
+from kpbench.report.figures import FIGURE_FORMATS, draw_panels
+from kpbench.report.latex import to_latex
 from kpbench.report.paper import PAPER, SYNTHETIC, SYNTHETIC_RADIUS_PX
 from kpbench.report.score_charts import (
     Figure,
@@ -23,6 +25,7 @@ from kpbench.report.score_charts import (
     precision_recall_chart,
     radius_chart,
     severity_chart,
+    severity_panel,
     taxonomy_charts,
 )
 from kpbench.report.score_tables import (
@@ -40,7 +43,7 @@ from kpbench.report.score_tables import (
     synthetic_table,
     verdict_table,
 )
-from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_latex, to_markdown
+from kpbench.report.tables import Cell, Estimate, Table, cell_text, to_markdown
 from kpbench.scoring.comparison import Comparison
 from kpbench.scoring.scores import Scores
 from kpbench.text import escape_markdown, escape_terminal
@@ -117,6 +120,24 @@ class Section:
     title: str
     lead: str
     blocks: tuple[Block, ...]
+
+
+def name_runs(runs: Sequence[Scores], names: Sequence[str] = ()) -> list[Scores]:
+    """Return scores under the given names, or else under the names of their detectors without version.
+
+    Detectors that would share a name keep their version.
+
+    Raises
+    ------
+    DataError
+        If the number of names differs from the number of scores, or two names are equal.
+    """
+    if names and (len(names) != len(runs) or len({*names}) < len(runs)):
+        raise DataError(
+            f"`names` are {', '.join(names)}; expected {len(runs)} different names, one per predictions file"
+        )
+    short = list(names) or [str(run.detector.get("name") or run.name) for run in runs]
+    return [run if short.count(name) > 1 else replace(run, name=name) for run, name in zip(runs, short, strict=True)]
 
 
 def make_sections(report: Report) -> list[Section]:
@@ -248,7 +269,7 @@ def to_markdown_report(report: Report) -> str:
 
 
 def to_latex_report(report: Report) -> str:
-    """Render the tables of a report as LaTeX, each in a ``table`` environment. Other text becomes comments."""
+    """Render the tables of a report as LaTeX, see :func:`kpbench.report.to_latex`. Other text becomes comments."""
 
     def comment(text: str) -> str:
         return "\n".join(f"% {escape_terminal(line)}" for line in text.splitlines())
@@ -344,7 +365,9 @@ REPORT_WRITERS: dict[str, Callable[[Report], str]] = {
     ".md": to_markdown_report,
     ".tex": to_latex_report,
 }
-"""For each file suffix, the function that renders a report."""
+"""For each file suffix, the function that renders a report as text."""
+REPORT_SUFFIXES = (*REPORT_WRITERS, *FIGURE_FORMATS)
+"""Suffixes of files that a report can be written to; a figure shows the severity curves alone."""
 
 
 def write_report(path: str | Path, report: Report) -> None:
@@ -353,13 +376,14 @@ def write_report(path: str | Path, report: Report) -> None:
     Parameters
     ----------
     path : str or Path
-        The suffix selects the format: .html, .md or .tex.
+        The suffix selects the format: .html, .md or .tex. A .pdf, .png or .svg shows the severity curves alone.
     report : Report
 
     Raises
     ------
     DataError
-        If the path does not end in .html, .md or .tex, or the file cannot be written.
+        If the path has another suffix, a figure is wanted of scores without conditions or without Matplotlib, or the
+        file cannot be written.
 
     Examples
     --------
@@ -369,16 +393,23 @@ def write_report(path: str | Path, report: Report) -> None:
     """
     path = Path(path)
     require_report_suffix(path)
-    write_file(path, encode_utf8(_add_mark(path.suffix.lower(), REPORT_WRITERS[path.suffix.lower()](report))))
+    suffix = path.suffix.lower()
+    if suffix in FIGURE_FORMATS:
+        panels = [severity_panel(report.runs, name) for name in _conditions(report)]
+        if not panels:
+            raise DataError(f"{path}: the images have no conditions, so there is no severity curve")
+        write_file(path, draw_panels(panels, suffix))
+    else:
+        write_file(path, encode_utf8(_add_mark(suffix, REPORT_WRITERS[suffix](report))))
 
 
 def require_report_suffix(path: Path) -> None:
-    """Refuse a path that does not end in .html, .md or .tex.
+    """Refuse a path that does not end in one of :data:`REPORT_SUFFIXES`.
 
     Raises
     ------
     DataError
-        If the path does not end in .html, .md or .tex.
+        If it does not.
     """
-    if path.suffix.lower() not in REPORT_WRITERS:
-        raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_WRITERS)}")
+    if path.suffix.lower() not in REPORT_SUFFIXES:
+        raise DataError(f"{path}: unknown kind of report, expected {', '.join(REPORT_SUFFIXES)}")

@@ -41,6 +41,8 @@ def overview_table(runs: Sequence[Scores]) -> Table:
     rows = [(run.name, *(get_estimate(run.overall, metric) for metric in metrics)) for run in runs]
     failed = [f"{run.name} failed on {len(f)} images" for run in runs if (f := run.detector.get("failures"))]
     note = f"{', '.join(failed)}, which count as no detections." if failed else ""
+    versions = [f"{run.name} {run.detector['version']}" for run in runs if run.detector.get("version")]
+    note = " ".join(filter(None, (note, f"Versions: {', '.join(versions)}." if versions else "")))
     return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows), note)
 
 
@@ -299,8 +301,9 @@ def verdict_table(comparisons: Sequence[Comparison]) -> Table:
     name = comparisons[0].first
     columns = ("against", "metric", name, "the other", "difference", "over all images", "rungs better", "even", "worse")
     note = (
-        "A difference is called better or worse when its paired 95 % interval does not contain 0. Between equal "
-        "detectors, chance makes about 5 rungs in 100 better or worse."
+        "A rung is better or worse if its paired 95 % interval does not contain 0 and its p-value, adjusted for all "
+        "rungs by Holm's method, is at most 0.05. Between equal detectors, chance makes any rung better or worse in "
+        "at most 5 of 100 comparisons."
     )
     return Table(f"{name} against the others", columns, tuple(rows), note)
 
