@@ -21,6 +21,7 @@ from .score_tables import group_table as group_table
 from .score_tables import overview_table as overview_table
 from .score_tables import paper_table as paper_table
 from .score_tables import pose_table as pose_table
+from .score_tables import slice_table as slice_table
 from .score_tables import verdict_table as verdict_table
 from .summary import summarise_comparisons as summarise_comparisons
 from .summary import summarise_scores as summarise_scores

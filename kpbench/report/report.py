@@ -40,6 +40,7 @@ from kpbench.report.score_tables import (
     overview_table,
     paper_table,
     reliability_table,
+    slice_table,
     synthetic_table,
     verdict_table,
 )
@@ -149,6 +150,7 @@ def make_sections(report: Report) -> list[Section]:
         _severity_section,
         _precision_recall_section,
         _radius_section,
+        _slices_section,
         _bias_section,
         _pose_section,
         _identity_section,
@@ -218,6 +220,14 @@ def _radius_section(report: Report) -> Section:
         blocks = (*charts, *(group_table(groups, f"By radius: {run.name}") for run, groups in bins))
     lead = "Only matches have errors, so no error exceeds the matching threshold."
     return Section("Localisation by radius", lead, blocks)
+
+
+def _slices_section(report: Report) -> Section:
+    lead = (
+        "Keypoints that are alike in one quantity, over all conditions. Tilt is that of the disc to the line of sight."
+    )
+    tables = (slice_table(report.runs),) if any(run.slices for run in report.runs) else ()
+    return Section("Slices", lead, tables)
 
 
 def _bias_section(report: Report) -> Section:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple
+from typing import Any
 
 from kpbench.report.paper import SYNTHETIC, PaperTable, paper_value
 from kpbench.report.tables import Cell, Estimate, Table
@@ -209,6 +210,35 @@ def group_table(
 
 def _describe_radii(low: float, high: float | None) -> str:
     return f"over {low:g}" if high is None else f"{low:g} to {high:g}"
+
+
+def slice_table(runs: Sequence[Scores]) -> Table:
+    """Tabulate the detection score by tilt, contrast and visible share: a row per bin, a column per detector.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
+    >>> kpbench.report.slice_table([scores]).columns
+    ('of', 'from', 'below', 'keypoints', 'oracle')
+    """
+    names = {"tilt_deg": "tilt (degrees)", "contrast": "contrast (grey levels)", "visible": "visible share"}
+    found: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
+    for run in runs:
+        for entry in run.slices:
+            found.setdefault((entry["quantity"], *entry["range"]), []).append(entry)
+    rows = [
+        (
+            names[quantity],
+            f"{low:g}",
+            "whole" if low == high else f"{high:g}",
+            entries[0]["truths"],
+            *(Estimate(e["detection_score"], e["interval"]) for e in entries),
+        )
+        for (quantity, low, high), entries in found.items()
+    ]
+    columns = ("of", "from", "below", "keypoints", *(run.name for run in runs))
+    return Table("Detection score by tilt, contrast and visible share", columns, tuple(rows))
 
 
 def count_table(runs: Sequence[Scores]) -> Table:
