@@ -15,7 +15,8 @@ from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite
 from kpbench.predictions.files import read_predictions
 from kpbench.provenance import image_source
-from kpbench.report.report import Report, name_runs, require_report_suffix, write_report
+from kpbench.report.detail_tables import pose_table
+from kpbench.report.report import require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
     encode_comparisons,
@@ -23,7 +24,7 @@ from kpbench.report.result_files import (
     encode_scores,
     encode_scores_csv,
 )
-from kpbench.report.score_tables import pose_table
+from kpbench.report.sections import Report, name_runs
 from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pose_errors
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score

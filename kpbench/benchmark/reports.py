@@ -11,9 +11,10 @@ from kpbench.benchmark.run import BenchRun
 from kpbench.files import make_folder
 from kpbench.provenance import UNKNOWN_SOURCE, image_source
 from kpbench.report.paper import PAPER
-from kpbench.report.report import Report, name_runs, write_report
+from kpbench.report.report import write_report
 from kpbench.report.result_files import collect_provenance, encode_scores
 from kpbench.report.score_tables import breakpoint_table, overview_table, paper_table
+from kpbench.report.sections import Report, name_runs
 from kpbench.report.tables import Table
 from kpbench.writing import write_file
 

@@ -19,7 +19,7 @@ PANEL_INCHES = 2.35, 1.85
 """Width and height of a panel; three panels fill the text width of a page in two columns."""
 MARKERS = "osD^vPX*h"
 """One marker per colour, so that lines can be told apart in print without colour."""
-STYLE: dict[str, Any] = {
+MATPLOTLIB_STYLE: dict[str, Any] = {
     "font.size": 7,
     "axes.linewidth": 0.6,
     "axes.grid": True,
@@ -70,7 +70,7 @@ def draw_panels(panels: Sequence[Panel], suffix: str, *, columns: int = 3) -> by
         raise DataError(f"a figure ({suffix}) needs one more package: pip install 'kpbench[report]'") from None
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    with matplotlib.rc_context({**matplotlib.rcParamsDefault, "backend": "agg", **STYLE}):
+    with matplotlib.rc_context({**matplotlib.rcParamsDefault, "backend": "agg", **MATPLOTLIB_STYLE}):
         figure = Figure((columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.35), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         named: dict[str, Any] = {}

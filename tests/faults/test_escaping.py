@@ -21,8 +21,9 @@ from kpbench.dataset.card import write_card
 from kpbench.dataset.folder import make_manifest, write_manifest
 from kpbench.errors import KpbenchWarning
 from kpbench.report.latex import to_latex
-from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report
+from kpbench.report.report import to_html, to_latex_report, to_markdown_report
 from kpbench.report.result_files import encode_scores_csv
+from kpbench.report.sections import Report
 from kpbench.report.tables import Estimate, Table, to_markdown, to_plain
 from kpbench.text import escape_csv, escape_csv_comment, escape_latex, escape_markdown, escape_terminal
 from kpbench.types import KEYPOINT_DTYPE, Truth

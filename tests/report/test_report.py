@@ -13,20 +13,23 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from kpbench.detectors.prediction import record_cost
 from kpbench.errors import DataError
 from kpbench.report.charts import LIGHT_COLOURS, Series, bar_chart, line_chart
+from kpbench.report.detail_tables import cost_table
 from kpbench.report.latex import to_latex
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
-from kpbench.report.report import Report, name_runs, to_html, to_latex_report, to_markdown_report, write_report
+from kpbench.report.report import to_html, to_latex_report, to_markdown_report, write_report
 from kpbench.report.result_files import encode_scores, encode_scores_csv
 from kpbench.report.score_charts import severity_chart
 from kpbench.report.score_tables import paper_table
+from kpbench.report.sections import Report, name_runs
 from kpbench.report.tables import Estimate, Table, to_markdown, to_plain
 from kpbench.report.worst_cases import pick_worst_cases
 from kpbench.scoring.breakpoints import find_breakpoints
 from kpbench.scoring.comparison import compare
 from kpbench.scoring.scores import score
-from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions, Truth
 from kpbench.writing import HEAD_BYTES, TAIL_BYTES, kind_of
 
 SHARE = {3: 1.0, 7: 0.95, 11: 0.5, 15: 0.25}  # of keypoints found at each rung
@@ -455,6 +458,14 @@ for (const table of document.querySelectorAll("table")) {
     }
   });
 }
+const toggle = document.querySelector("[data-toggle]"), figure = toggle.closest("figure");
+const line = figure.querySelector("polyline"), chart = figure.querySelector("svg.chart");
+const box = chart.getBoundingClientRect();
+toggle.click(); out.off = getComputedStyle(line).display; toggle.click(); out.on = getComputedStyle(line).display;
+const move = () => chart.dispatchEvent(new PointerEvent("pointermove", {clientX: box.right - 5, clientY: box.top + 9}));
+move(); out.read = figure.querySelector(".readout").textContent;
+figure.querySelector("[data-zoom]").click(); out.zoomed = chart.getAttribute("viewBox");
+figure.querySelector("[data-zoom='0']").click(); out.whole = chart.getAttribute("viewBox");
 out.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 out.drawn = [...document.querySelectorAll(".case image")].every(i => i.getBBox().width > 0);
 document.body.textContent = "PROBE" + JSON.stringify(out) + "PROBE";
@@ -507,6 +518,9 @@ def test_the_page_works_in_a_browser_without_network(report, tmp_path, width):
     assert probe["galleries"] == 12
     assert probe["drawn"]
     assert probe["wrong"] == []
+    assert (probe["off"], probe["on"]) == ("none", "inline")
+    assert probe["read"].startswith("detector: 0.250")
+    assert (probe["zoomed"] != probe["whole"], probe["whole"]) == (True, "0 0 480 300")
     assert probe["focus"] == probe["sorts"] > 20
     assert probe["wide"] <= 0  # tables scroll in their own boxes, the page never sideways
 
@@ -518,3 +532,18 @@ def test_the_browser_test_would_see_a_request_and_an_error(tmp_path):
     _, console, asked = browse(page, tmp_path / "profile")
     assert len(console) == 2
     assert any("http://kpbench.invalid/x.png" in line for line in asked)
+
+
+# --- time and memory --------------------------------------------------------------------------------------------
+
+
+def test_what_a_detector_took_stands_in_the_report_of_its_predictions(scores):
+    assert cost_table([scores]).rows == ()
+    found = Predictions.from_detections([Detections.none()] * 2, [0, 1], {"name": "a"}, "", ms=[2.0, 4.0])
+    cost = record_cost(found).detector["cost"]
+    assert (cost["ms_median"], cost["machine"]) == (3.0, cost["machine"])
+    assert cost["peak_mib"] is None or 10 < cost["peak_mib"] < 10**5
+    told = score(Truth(**{**vars(ladder(1, {3: 1.0})[0])}), [Detections.none()], resamples=0)
+    told.outcomes.detector.update(cost={"ms_median": 3.0, "ms_p95": [], "machine": "<x>"})
+    assert cost_table([told]).rows == (("detector", 3.0, "[]", None, "<x>"),)
+    assert "Time and memory" in to_markdown_report(Report((told,)))
