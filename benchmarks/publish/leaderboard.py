@@ -53,8 +53,11 @@ and runs the detector again on a random 2 % of them. `python benchmarks/publish/
 --verified verified.json` puts the scores into `benchmarks/results`. The column *verified* says on how many images the
 rerun found the same; *no* means that nobody has rerun the detector.
 
-The scores were made with version 1 of the pixels and version 7 of the verification. What has changed since
-then, and how little it moved on 250 images, stands at the head of the [findings](findings.md).
+`extended-v2`, and the boards of tags on `extended-v1`, were measured on 2026-12-01, the tags at their
+[tuned settings](../explanation/fairness-to-tags.md#each-tag-has-its-best-detector). All other scores are older: they
+were made with version 1 of the pixels and version 7 of the verification, and the boards of tags on `paper-v1` with
+settings that were not tuned. What has changed since then, and how little it moved on 250 images, stands at the head of
+the [findings](findings.md).
 """
 
 
@@ -66,11 +69,14 @@ def take(folder: Path, verified: Path | None) -> None:
         scores = json.loads(path.read_text())
         scores["verified_images"] = images.get(hashlib.sha256(path.read_bytes()).hexdigest(), 0)
         scores["by"] = [group for group in scores["by"] if group["patch_id"] is None and group["radius_px"] is None]
-        for key in ("confusion", "curve"):
-            del scores[key]
+        for key in ("confusion", "curve", "slices"):
+            scores.pop(key, None)
         scores["detector"].pop("failures", None)
         known = scores["provenance"]  # whose folder the photographs lie in is nobody's business
         known["command"] = re.sub(r"(--backgrounds[ =])\S+", r"\1PHOTOS", known["command"])
+        known["command"] = re.sub(r" --out[ =]\S+", "", known["command"])
+        known["predictions"] = [{**entry, "file": Path(entry["file"]).name} for entry in known["predictions"]]
+        known["dataset"]["path"] = Path(known["dataset"]["path"]).name
         target = RESULTS / folder_name(known["config"]) / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(json.dumps(scores, sort_keys=True) + "\n")
