@@ -142,7 +142,7 @@ def verify_submission(
     found = []
     for file in files:
         content = read_scores_json(file)
-        suite, detector = str(content["provenance"]["config"]["suite"]), str(content["detector"]["name"])
+        suite, detector = content["provenance"]["config"]["suite"], content["detector"]["name"]
         config = _suite_config(content["provenance"]["config"], file, backgrounds)
         images: tuple[int, ...] = ()
         if not (problem := _find_config_fault(config, content)):
@@ -163,9 +163,10 @@ def read_scores_json(file: Path) -> dict[str, Any]:
     try:
         content = load_json(read_bytes(file))
         schema, config, detector = content["schema"], content["provenance"]["config"], content["detector"]
-        for key in ("suite", "images", "seed", "size_px", "conditions", "backgrounds"):
-            config[key]
-        str(detector["name"]), content["dataset"]["fingerprint"], content["provenance"]["predictions"][0]["sha256"]
+        digest = content["provenance"]["predictions"][0]["sha256"]
+        texts = (config["suite"], detector["name"], content["dataset"]["fingerprint"], digest)
+        if not all(isinstance(text, str) for text in texts):
+            raise TypeError("a name or digest is no text")
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise DataError(f"{file}: {type(error).__name__}: {error}, expected the scores of a suite") from None
     if schema != SCHEMA:

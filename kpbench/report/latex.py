@@ -34,7 +34,7 @@ def to_latex(table: Table) -> str:
     --------
     >>> import kpbench
     >>> text = kpbench.report.to_latex(kpbench.report.Table("Scores", ("detector", "score"), (("a_b", 0.5),)))
-    >>> print(text.splitlines()[9])
+    >>> print(text.splitlines()[8])
     a\_b & 0.500 \\
     """
     keys = next((n for n in range(MOST_KEYS) if not _is_text(table, n)), MOST_KEYS)
