@@ -1,5 +1,7 @@
 from .benchmark.reports import SuiteReport as SuiteReport
 from .benchmark.reports import write_suite_reports as write_suite_reports
+from .benchmark.rerun import Verification as Verification
+from .benchmark.rerun import verify_submission as verify_submission
 from .benchmark.run import BenchRun as BenchRun
 from .benchmark.run import bench as bench
 from .benchmark.run import bench_dataset as bench_dataset

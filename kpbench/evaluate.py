@@ -15,7 +15,8 @@ from kpbench.errors import DataError, PredictionsError
 from kpbench.files import refuse_overwrite
 from kpbench.predictions.files import read_predictions
 from kpbench.provenance import image_source
-from kpbench.report.report import Report, require_report_suffix, write_report
+from kpbench.report.detail_tables import pose_table
+from kpbench.report.report import require_report_suffix, write_report
 from kpbench.report.result_files import (
     collect_provenance,
     encode_comparisons,
@@ -23,7 +24,7 @@ from kpbench.report.result_files import (
     encode_scores,
     encode_scores_csv,
 )
-from kpbench.report.score_tables import pose_table
+from kpbench.report.sections import Report, name_runs
 from kpbench.scoring.board_pose import PoseGroup, compute_pose_errors, group_pose_errors
 from kpbench.scoring.comparison import Comparison, compare
 from kpbench.scoring.scores import Scores, score
@@ -113,6 +114,7 @@ def score_file(
     csv_file: str | Path | None = None,
     images_csv_file: str | Path | None = None,
     report_file: str | Path | None = None,
+    names: Sequence[str] = (),
     command: Sequence[str] = (),
     warn: Callable[[str], None] = warnings.warn,
     **options: Unpack[ScoreOptions],
@@ -130,7 +132,9 @@ def score_file(
         Whether to compute errors of the board's pose also. The dataset must be made from a suite.
     json_file, csv_file, images_csv_file, report_file : str, Path or None
         Files to write: all scores as JSON, one row per group as CSV, one row per image as CSV, and a report (.html, .md
-        or .tex).
+        or .tex; severity curves as .pdf, .png or .svg).
+    names : sequence of str
+        Name of the detector in the report. Empty: the name in the predictions, without version.
     command : sequence of str
         The command line, for the provenance.
     warn : function
@@ -170,7 +174,7 @@ def score_file(
     if to_images:
         write_file(to_images, encode_images_csv(scores))
     if to_report:
-        _write_report(to_report, [scores], dataset, provenance, warn, poses=poses)
+        _write_report(to_report, name_runs([scores], names), dataset, provenance, warn, poses=poses)
     return ScoredFile(scores, dataset, poses, provenance)
 
 
@@ -180,6 +184,7 @@ def compare_files(
     *,
     json_file: str | Path | None = None,
     report_file: str | Path | None = None,
+    names: Sequence[str] = (),
     command: Sequence[str] = (),
     warn: Callable[[str], None] = warnings.warn,
     **options: Unpack[ScoreOptions],
@@ -193,7 +198,11 @@ def compare_files(
     truth, command, warn, **options
         As for :func:`score_file`. None as `truth` takes the dataset that the first file names.
     json_file, report_file : str, Path or None
-        Files to write: all differences as JSON, and a report (.html, .md or .tex).
+        Files to write: all differences as JSON, and a report (.html, .md or .tex; severity curves as .pdf, .png or
+        .svg).
+    names : sequence of str
+        Names of the detectors, one per file. Empty: the names in the predictions; detectors that share a name are told
+        apart by version and file.
 
     Returns
     -------
@@ -218,6 +227,7 @@ def compare_files(
     paths, to_json, to_report = [Path(file) for file in predictions], _as_path(json_file), _as_path(report_file)
     _refuse_overwrite(paths, {"comparison": to_json, "report": to_report})
     dataset, scores = _score_files(paths, truth, warn, options)
+    scores = name_runs(scores, names)
     comparisons = tuple(compare(scores[0], other) for other in scores[1:])
     provenance = collect_provenance(dataset, paths, command)
     if to_json:

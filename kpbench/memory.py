@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from contextlib import suppress
 from pathlib import Path
 
@@ -24,6 +25,20 @@ def free_bytes() -> int | None:
         cache = (_CGROUP / "memory.stat").read_text().split("inactive_file ")[1].split()[0]
         found.append(limit - int((_CGROUP / "memory.current").read_text()) + int(cache))
     return min(found, default=None)
+
+
+def peak_mib() -> int | None:
+    """Return the largest resident memory that this process, or one that it waited for, has had, MiB.
+
+    None if the system does not tell.
+    """
+    with suppress(ImportError, OSError, ValueError):  # not on every system
+        import resource
+
+        unit = 1 if sys.platform == "darwin" else 1024  # bytes there, KiB elsewhere
+        whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        return max(resource.getrusage(who).ru_maxrss for who in whose) * unit // 2**20
+    return None
 
 
 def require_memory(needed_bytes: int, what: str) -> None:

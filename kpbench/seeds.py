@@ -18,6 +18,8 @@ SUITE_CAMERA, SUITE_SENSOR = 20, 21
 SUITE_FILM = 22
 """The same: path of the board, and the bar before it, of a film. Frame k of scene n of films of N frames takes the
 noise of its sensor from SUITE_SENSOR of n·N + k."""
+SUITE_CLUTTER = 23
+"""The same: the look-alikes on the background of a base scene."""
 
 
 def stage_rng(seed: int, index: int, stage: int) -> np.random.Generator:

@@ -64,8 +64,8 @@ def test_a_missing_dataset_is_a_warning_where_another_is_at_hand(here):
 
 
 def test_files_that_cannot_be_written_are_refused_before_anything_is_read(here):
-    with pytest.raises(DataError, match=r"r\.pdf: unknown kind of report"):
-        score_file("none.json", report_file="r.pdf")
+    with pytest.raises(DataError, match=r"r\.doc: unknown kind of report"):
+        score_file("none.json", report_file="r.doc")
     with pytest.raises(DataError, match="this command reads it"):
         compare_files(["none.json", "p.json"], json_file="p.json")
 

@@ -1,7 +1,7 @@
-"""The leaderboard, its figure and the table of the findings from the scores in benchmarks/results.
+"""The leaderboard, its figures and the table of the findings from the scores in benchmarks/results.
 
-    python benchmarks/publish/leaderboard.py                        # writes three files of docs/results
-    python benchmarks/publish/leaderboard.py --take kpbench-bench   # first copy what `kpbench bench` found there
+    python benchmarks/publish/leaderboard.py                        # writes four files of docs/results
+    python benchmarks/publish/leaderboard.py --take kpbench-bench --verified verified.json   # first copy these scores
 
 The table of the findings and the figure show `paper-v1` at 640x480 over procedural backgrounds; results of another
 size or over photographs are kept apart.
@@ -11,6 +11,7 @@ Of a scores file only what the tables need is kept: all images, and every condit
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 from collections.abc import Sequence
@@ -18,14 +19,13 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.report import (
-    CHART_COLOURS,
-    CHART_STYLE,
     PAPER,
     Cell,
     Estimate,
+    Panel,
     Series,
     Table,
-    line_chart,
+    draw_panels,
     to_markdown,
 )
 from kpbench.scoring import LABELS
@@ -33,12 +33,11 @@ from kpbench.scoring import LABELS
 ROOT = Path(__file__).parents[2]
 RESULTS, DOCS = ROOT / "benchmarks" / "results", ROOT / "docs" / "results"
 PAGE, FINDINGS, FIGURE = DOCS / "leaderboard.md", DOCS / "findings.md", DOCS / "severity.svg"
-ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "aruco", "charuco", "sift", "orb")
+ORDER = ("template", "superpoint-small", "superpoint", "apriltag", "napa", "locus", "aruco", "charuco", "sift", "orb")
 SHOWN_METRICS = ("detection_score", "id_matching_score", "average_false_alarm", "error_median_px")
 PAPER_STYLE = 7
 QUICK_PX = (640, 480)
 """The size of `kpbench bench --quick`."""
-PANEL = (480, 300)
 
 HEAD = """\
 # Leaderboard
@@ -48,25 +47,36 @@ All images are **simulated**. Brackets hold 95 % intervals from resampled scenes
 each table. What boards of tags are, and how far they compare with patches:
 [patches against tags](../explanation/fairness-to-tags.md).
 
-To enter a detector: run the command below a heading with `--detector` yours, then
-`python benchmarks/publish/leaderboard.py --take kpbench-bench`, and send the JSON file that this puts into
-`benchmarks/results`. It names the dataset by its fingerprint, and whoever has the detector gets the same numbers from
-the same command.
+To enter a detector: run the command below a heading with `--detector` yours, and send the folders `scores` and
+`predictions` of `kpbench-bench`. `kpbench leaderboard verify kpbench-bench --json verified.json` makes the images anew,
+and runs the detector again on a random 2 % of them. `python benchmarks/publish/leaderboard.py --take kpbench-bench
+--verified verified.json` puts the scores into `benchmarks/results`. The column *verified* says on how many images the
+rerun found the same; *no* means that nobody has rerun the detector.
 
-The scores were made with version 1 of the pixels and version 7 of the verification. What has changed since
-then, and how little it moved on 250 images, stands at the head of the [findings](findings.md).
+`extended-v2`, and the boards of tags on `extended-v1`, were measured on 2026-12-01, the tags at their
+[tuned settings](../explanation/fairness-to-tags.md#each-tag-has-its-best-detector). All other scores are older: they
+were made with version 1 of the pixels and version 7 of the verification, and the boards of tags on `paper-v1` with
+settings that were not tuned. What has changed since then, and how little it moved on 250 images, stands at the head of
+the [findings](findings.md).
 """
 
 
-def take(folder: Path) -> None:
+def take(folder: Path, verified: Path | None) -> None:
+    """Copy scores, and into them on how many images a rerun of the detector found the same."""
+    entries = json.loads(verified.read_text())["results"] if verified else []
+    images = {entry["scores_sha256"]: entry["images"] for entry in entries if not entry["problem"]}
     for path in sorted(folder.glob("scores/*/*.json")):
         scores = json.loads(path.read_text())
+        scores["verified_images"] = images.get(hashlib.sha256(path.read_bytes()).hexdigest(), 0)
         scores["by"] = [group for group in scores["by"] if group["patch_id"] is None and group["radius_px"] is None]
-        for key in ("confusion", "curve"):
-            del scores[key]
+        for key in ("confusion", "curve", "slices"):
+            scores.pop(key, None)
         scores["detector"].pop("failures", None)
         known = scores["provenance"]  # whose folder the photographs lie in is nobody's business
         known["command"] = re.sub(r"(--backgrounds[ =])\S+", r"\1PHOTOS", known["command"])
+        known["command"] = re.sub(r" --out[ =]\S+", "", known["command"])
+        known["predictions"] = [{**entry, "file": Path(entry["file"]).name} for entry in known["predictions"]]
+        known["dataset"]["path"] = Path(known["dataset"]["path"]).name
         target = RESULTS / folder_name(known["config"]) / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(json.dumps(scores, sort_keys=True) + "\n")
@@ -105,8 +115,15 @@ def overall(runs: list[dict[str, Any]]) -> Table:
         board = run["provenance"]["config"].get("board", {"name": "patches"})["name"]
         images = run["metrics"]["counts"]["images"]
         about = (run["detector"]["name"], run["detector"]["version"], board, images)
-        rows.append((*about, *(estimate(run["metrics"], name) for name in SHOWN_METRICS)))
-    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in SHOWN_METRICS))
+        verified = run.get("verified_images")
+        rows.append(
+            (
+                *about,
+                *(estimate(run["metrics"], name) for name in SHOWN_METRICS),
+                f"on {verified} images" if verified else "no",
+            )
+        )
+    columns = ("detector", "version", "board", "images", *(LABELS[name] for name in SHOWN_METRICS), "verified")
     return Table("All conditions", columns, tuple(rows))
 
 
@@ -152,8 +169,8 @@ def crossing(run: dict[str, Any], condition: str) -> str:
     return "; ".join(b["crossing"] + (f" at {b['rung']:.3g}" if b["rung"] is not None else "") for b in found)
 
 
-def figure(runs: list[dict[str, Any]]) -> str:
-    """Detection score over the paper's five conditions, and whose line is whose."""
+def figure(runs: list[dict[str, Any]]) -> list[Panel]:
+    """Detection score over the paper's five conditions."""
     panels = []
     for table in PAPER.values():
         series = []
@@ -161,41 +178,22 @@ def figure(runs: list[dict[str, Any]]) -> str:
             found = [(rung, estimate(metrics, "detection_score")) for rung, metrics in rungs(run, table.condition)]
             x, y = [rung for rung, _ in found], [e.value for _, e in found]
             series.append(Series(run["detector"]["name"], x, y, [e.interval for _, e in found], n + (n >= PAPER_STYLE)))
-        paper = Series("paper", table.rungs, table.detection_score, style=PAPER_STYLE, dashed=True)
-        unit = f" ({table.unit})" if table.unit else ""
-        label, log = f"{table.title}{unit}", table.condition == "scale"
-        panels.append(
-            line_chart([*series, paper], label, "detection score", y_range=(0, 1), x_ticks=table.rungs, log_x=log)
-        )
-    names = [*((n + (n >= PAPER_STYLE), run["detector"]["name"]) for n, run in enumerate(runs))]
-    names.append((PAPER_STYLE, "the paper, photographs (dashed); all others: simulated"))
-    legend = "".join(
-        f'<circle class="s{style % CHART_COLOURS}" cx="60" cy="{30 + 26 * row}" r="6"/>'
-        f'<text x="78" y="{34 + 26 * row}">{name}</text>'
-        for row, (style, name) in enumerate(names)
-    )
-    inside = [re.sub(r"^<svg[^>]*>|</svg>$", "", panel) for panel in panels] + [legend]
-    width, height = 2 * PANEL[0], 3 * PANEL[1]
-    cells = "".join(
-        f'<g class="chart" transform="translate({n % 2 * PANEL[0]} {n // 2 * PANEL[1]})">{part}</g>'
-        for n, part in enumerate(inside)
-    )
-    own = ":root{color:#1c1e21;font:12px system-ui,sans-serif}@media (prefers-color-scheme:dark){:root{color:#e6e8eb}}"
-    about = "Detection score over severity, simulated, beside the paper's photographs"
-    return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{about}" viewBox="0 0 {width} {height}" '
-        f'width="{width}" height="{height}"><style>{own}{CHART_STYLE}</style>{cells}</svg>\n'
-    )
+        name = "the paper, photographs (all others: simulated)"
+        paper = Series(name, table.rungs, table.detection_score, style=PAPER_STYLE, dashed=True)
+        label = f"{table.title} ({table.unit})" if table.unit else table.title
+        is_log = table.condition == "scale"
+        panels.append(Panel((*series, paper), label, "detection score", (0, 1), table.rungs, is_log))
+    return panels
 
 
-def page(results: Path) -> tuple[str, str]:
-    """The page as Markdown, and its figure as SVG."""
-    parts, picture = [HEAD], ""
+def page(results: Path) -> tuple[str, list[Panel]]:
+    """The page as Markdown, and the panels of its figure."""
+    parts, picture = [HEAD], list[Panel]()
     for suite in sorted(results.iterdir(), reverse=True):
         runs = load(suite)
         config = runs[0]["provenance"]["config"]
         if suite.name == "paper-v1":
-            parts.append("![Detection score over severity](severity.svg)\n")
+            parts.append("![Detection score over severity](severity.svg)\n\nAlso as [PDF](severity.pdf).\n")
             picture = figure(runs)
         size = "x".join(map(str, config["size_px"]))
         command = f"kpbench bench --suite {config['suite']} --images {config['images']} --size {size}"
@@ -213,13 +211,17 @@ def page(results: Path) -> tuple[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--take", type=Path, metavar="FOLDER", help="copy the scores of a `kpbench bench` folder first")
-    folder = parser.parse_args().take
-    if folder:
-        take(folder)
+    parser.add_argument(
+        "--verified", type=Path, metavar="FILE", help="of `kpbench leaderboard verify FOLDER --json FILE`"
+    )
+    options = parser.parse_args()
+    if options.take:
+        take(options.take, options.verified)
     text, picture = page(RESULTS)
     FINDINGS.write_text(findings(FINDINGS.read_text(), load(RESULTS / "paper-v1")))
     PAGE.write_text(text)
-    FIGURE.write_text(picture)
+    for suffix in (".svg", ".pdf"):
+        FIGURE.with_suffix(suffix).write_bytes(draw_panels(picture, suffix))
 
 
 if __name__ == "__main__":

@@ -59,6 +59,7 @@ score small.csv --gt set --report report.tex
 plan --pilot small.csv --gt set --margin 0.1 --json plan.json
 compare small.csv template.json --gt set --json compared.json --report compared.html
 bench --suite paper-v1 --images 1 --size 203x155 --only blur --detector orb --detector aruco --out bench
+leaderboard verify bench --out again --json verified.json
 suite video-v1 --images 1 --frames 3 --size 406x310 --only speed --out films
 track films --poses poses.jsonl --overlay tracked.mp4
 score poses.jsonl --gt films

@@ -11,9 +11,10 @@ from kpbench.benchmark.run import BenchRun
 from kpbench.files import make_folder
 from kpbench.provenance import UNKNOWN_SOURCE, image_source
 from kpbench.report.paper import PAPER
-from kpbench.report.report import Report, write_report
+from kpbench.report.report import write_report
 from kpbench.report.result_files import collect_provenance, encode_scores
 from kpbench.report.score_tables import breakpoint_table, overview_table, paper_table
+from kpbench.report.sections import Report, name_runs
 from kpbench.report.tables import Table
 from kpbench.writing import write_file
 
@@ -84,7 +85,7 @@ def write_suite_reports(
 
 
 def _write_suite_report(suite: str, runs: Sequence[BenchRun], out: Path, command: Sequence[str]) -> SuiteReport:
-    dataset, scores = runs[0].dataset, tuple(run.scores for run in runs)
+    dataset, scores = runs[0].dataset, tuple(name_runs([run.scores for run in runs]))
     source = image_source(dataset.config)
     title = ", ".join(filter(None, (suite, source)))
     provenance = collect_provenance(dataset, [run.predictions for run in runs], command)
@@ -96,7 +97,8 @@ def _write_suite_report(suite: str, runs: Sequence[BenchRun], out: Path, command
         provenance = collect_provenance(run.dataset, [run.predictions], command)
         name = f"{run.predictions.stem.rpartition('-')[0]}.json"
         write_file(folder / name, encode_scores(run.scores, provenance | {"config": run.dataset.config}))
-    patches = [run.scores for run in runs if run.config is None or run.config.board is None]
+    pairs = zip(runs, scores, strict=True)
+    patches = [named for run, named in pairs if run.config is None or run.config.board is None]
     images = source or UNKNOWN_SOURCE
     tables = [
         paper_table(patches, PAPER[name], images) for run in patches[:1] for name in run.conditions if name in PAPER

@@ -128,7 +128,7 @@ def bench(
             for name, detector in loaded.items():
                 config = replace(suite, board=detector.board)
                 if config not in datasets:
-                    datasets[config] = _make_dataset(config, Path(out, "suites"), workers, progress)
+                    datasets[config] = make_suite_dataset(config, Path(out, "suites"), workers, progress)
                 jobs.append(_Job(suite.suite.name, config, datasets[config], name, detector))
         return _run_jobs(jobs, Path(out), workers, progress)
 
@@ -267,7 +267,8 @@ def _report_files(suite: str, detectors: Sequence[str], out: Path) -> dict[Path,
     return {out / f"{suite}.html": "report", out / f"{suite}.md": "report"} | dict.fromkeys(scores, "scores")
 
 
-def _make_dataset(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
+def make_suite_dataset(config: SuiteConfig, folder: Path, workers: int | None, progress: Progress) -> Dataset:
+    """Make the images of a suite in a subfolder that their configuration names, or open them if they are there."""
     content = canonical_json([__version__, config.to_dict()]).encode()
     place = folder / f"{config.name}-{hashlib.sha256(content).hexdigest()[:8]}"
     if (place / MANIFEST).exists():

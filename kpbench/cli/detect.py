@@ -70,6 +70,7 @@ SHIPPED_DESIGNS_ONLY = ("template", "superpoint", "superpoint-small")
     is_flag=True,
     help="Look for patches that the detector missed, where their board says that they must be. Runs in one process.",
 )
+@click.option("--cost", is_flag=True, help="Record time, peak memory and the machine in the file, for reports.")
 @PATCHES
 @WORKERS
 def detect(
@@ -82,6 +83,7 @@ def detect(
     camera: Path | None,
     poses: Path | None,
     second_look: bool,
+    cost: bool,
     patches: tuple[Path, ...],
     workers: int | None,
 ) -> None:
@@ -105,7 +107,7 @@ def detect(
     """
     from kpbench.cli.progress import progress_bar
     from kpbench.detectors.interface import load_detector
-    from kpbench.detectors.prediction import predict
+    from kpbench.detectors.prediction import predict, record_cost
     from kpbench.detectors.sources import has_other_designs, open_source
     from kpbench.images import ImageSource
     from kpbench.patches.design import load_patches
@@ -141,7 +143,8 @@ def detect(
         text = () if is_streamed else (f"{out} is not written; the same command starts anew",)
         raise KeyboardInterrupt(*text) from None
     if not is_streamed:
-        write_predictions(out, finder.locate(run.predictions))
+        located = finder.locate(run.predictions)
+        write_predictions(out, record_cost(located) if cost else located)
     finder.write()
     name = "stdout" if is_streamed else out
     echo(f"{name}: {len(run.predictions.xy)} detections in {len(run.predictions)} images", err=is_streamed)

@@ -39,9 +39,9 @@ class Limit(click.ParamType[tuple[str, float]]):
 
 def report_suffixes() -> Iterable[str]:
     """Return the suffixes of report files."""
-    from kpbench.report.report import REPORT_WRITERS
+    from kpbench.report.report import REPORT_SUFFIXES
 
-    return REPORT_WRITERS
+    return REPORT_SUFFIXES
 
 
 FILE = click.Path(dir_okay=False, path_type=Path)
@@ -86,8 +86,9 @@ def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
             "--report",
             "report_file",
             type=FileOfSuffix(report_suffixes),
-            help="Write tables and charts: .html (one offline page), .md, .tex.",
+            help="Write tables and charts: .html (one offline page), .md, .tex; severity curves: .pdf, .png, .svg.",
         ),
+        click.option("--name", "names", multiple=True, help="Name of a detector in the report; once per file."),
     )
     for option in reversed(options):
         command = option(command)

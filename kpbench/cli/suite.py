@@ -68,7 +68,7 @@ def suite(
 ) -> None:
     """Write the images of a benchmark suite into a dataset folder.
 
-    NAME is paper-v1, extended-v1, camera-v1, video-v1, or a .toml file of your own.
+    NAME is paper-v1, extended-v1, extended-v2, camera-v1, video-v1, or a .toml file of your own.
 
     \b
     Examples:

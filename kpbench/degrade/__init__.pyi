@@ -16,6 +16,7 @@ from .ladder import apply_effects as apply_effects
 from .ladder import draw_effect as draw_effect
 from .ladder import draw_ladder_mix as draw_ladder_mix
 from .ladder import draw_paper_mix as draw_paper_mix
+from .occluders import limbs as limbs
 from .own_images import degrade_files as degrade_files
 from .own_images import open_own_images as open_own_images
 from .weather import rain as rain

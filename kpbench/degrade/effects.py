@@ -10,6 +10,7 @@ The record of an effect is a dict: the effect's name under "effect", and the arg
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, Literal
 
@@ -244,7 +245,7 @@ def low_light(
     return to_uint8(numbers * np.float32(255 / (steps * gain * light)))
 
 
-def _strip_corners(strips: list[list[float]]) -> list[Float]:
+def strip_corners(strips: list[list[float]]) -> list[Float]:
     """Return the corners of each strip of an occlusion, ndarray of shape (4, 2), px."""
     unit_square = np.array([[0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5], [0.5, -0.5]])
     corners = []
@@ -274,27 +275,32 @@ def occlusion(image: UInt8, strips: list[list[float]]) -> UInt8:
     >>> occlusion(np.full((1, 6), 90, np.uint8), [[2, 0, 2, 5, 0, 20]])
     array([[90, 55, 20, 55, 90, 90]], dtype=uint8)
     """
+    return paint_polygons(image, strip_corners(strips), [strip[5] for strip in strips])
+
+
+def paint_polygons(image: UInt8, polygons: Sequence[Float], levels: Sequence[float]) -> UInt8:
+    """Lay opaque polygons of one grey level each over the image, by exact area coverage."""
     result = image.copy()
-    for polygon, strip in zip(_strip_corners(strips), strips, strict=True):
+    for polygon, level in zip(polygons, levels, strict=True):
         box = bounding_box([polygon])
         in_image, in_box = clip_to_image(box, image)
         part = result[in_image]
         if part.size:
             cover = for_all_channels(rasterise([[polygon]], [box])[0][in_box], image)
-            result[in_image] = to_uint8(part + (float(strip[5]) - part) * cover)
+            result[in_image] = to_uint8(part + (float(level) - part) * cover)
     return result
 
 
-def occlusion_cover(strips: list[list[float]], box: Box) -> Float:
-    """Return the fraction of each pixel of a box that the strips hide, ndarray of shape (height, width)."""
+def polygon_cover(polygons: Sequence[Float], box: Box) -> Float:
+    """Return the fraction of each pixel of a box that the polygons hide, ndarray of shape (height, width)."""
     x, y, w, h = box
     uncovered = np.ones((h, w))
-    for polygon in _strip_corners(strips):
-        strip_box = bounding_box([polygon])
-        relative_box = (strip_box[0] - x, strip_box[1] - y, *strip_box[2:])
-        in_box, in_strip = clip_to_image(relative_box, uncovered)
+    for polygon in polygons:
+        polygon_box = bounding_box([polygon])
+        relative_box = (polygon_box[0] - x, polygon_box[1] - y, *polygon_box[2:])
+        in_box, in_polygon = clip_to_image(relative_box, uncovered)
         if uncovered[in_box].size:
-            uncovered[in_box] *= 1 - rasterise([[polygon]], [strip_box])[0][in_strip]
+            uncovered[in_box] *= 1 - rasterise([[polygon]], [polygon_box])[0][in_polygon]
     return 1 - uncovered
 
 

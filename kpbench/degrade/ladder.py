@@ -19,7 +19,9 @@ from kpbench.degrade.effects import (
     noise,
     occlusion,
     shadow_edge,
+    strip_corners,
 )
+from kpbench.degrade.occluders import draw_cable, draw_hand, limb_outlines, limbs
 from kpbench.degrade.weather import rain, rainfall, shadow
 from kpbench.errors import DataError
 from kpbench.portable import arctan2, cos_sin_of
@@ -135,6 +137,8 @@ LADDER: dict[str, Severity] = {
     "low-light": Severity((4, 6, 8, 9), "stops", (0, 14), _set_parameter("low_light", "stops")),
     "occlusion": Severity((10, 20, 30, 40), "% of each patch", (0.1, 99), _draw_occlusion),
     "flare": Severity((60, 120, 180, 240), "grey levels", (0, 1000), _draw_flare),
+    "hand": Severity((20, 35, 50, 65), "% of the board", (0, 100), draw_hand),
+    "cable": Severity((1, 2, 4, 8), "cables", (1, 64), draw_cable),
 }
 """The severity of each effect, by the effect's name."""
 
@@ -276,8 +280,14 @@ EFFECT_FUNCTIONS: dict[str, Callable[..., UInt8]] = {
     "low_light": low_light,
     "occlusion": occlusion,
     "flare": flare,
+    "limbs": limbs,
 }
 """The function of each effect, by the name in the effect's record."""
+OUTLINES_OF_COVER: dict[str, Callable[[Effect], list[Float]]] = {
+    "occlusion": lambda record: strip_corners(record["strips"]),
+    "limbs": lambda record: limb_outlines(record["limbs"]),
+}
+"""Effects that hide what is behind them, and the function that returns the outlines of what they lay over an image."""
 RANDOM_FIELD_EFFECTS = ("noise", "low_light")
 """Effects that draw random numbers for every pixel. Their records do not hold these numbers."""
 

@@ -9,6 +9,7 @@ from .interface import load_detector as load_detector
 from .prediction import PredictionRun as PredictionRun
 from .prediction import predict as predict
 from .prediction import predict_images as predict_images
+from .prediction import record_cost as record_cost
 from .sources import has_other_designs as has_other_designs
 from .sources import open_source as open_source
 from .superpoint import SmallSuperPointDetector as SmallSuperPointDetector

@@ -36,6 +36,8 @@ DETECTORS = {
     "aruco": "kpbench.detectors.tags:ArucoDetector",
     "apriltag": "kpbench.detectors.tags:AprilTagDetector",
     "charuco": "kpbench.detectors.tags:CharucoDetector",
+    "napa": "kpbench.detectors.tags:NapaDetector",
+    "locus": "kpbench.detectors.tags:LocusDetector",
 }
 """Name of each shipped detector → its definition, as ``MODULE:ATTR``."""
 PROGRAM_PREFIX = "program:"

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import math
+import platform
 import time
 import traceback
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,10 +22,11 @@ from kpbench.detectors.inverted import InvertedPrints
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE
 from kpbench.images import UNDECODABLE, ImageSource, image_writer
+from kpbench.memory import peak_mib
 from kpbench.opencv import opencv_version, warn_of_opencv
 from kpbench.predictions.coco import CocoDataset
 from kpbench.types import Detections, Int, Predictions, UInt8
-from kpbench.workers import Progress, run_jobs
+from kpbench.workers import Progress, count_cores, run_jobs
 
 IMAGES_PER_PIECE = 32
 """Number of images that a worker process gets at a time."""
@@ -217,6 +219,26 @@ def _finish(
     return PredictionRun(_collect(detector, found, labels, ids, source), failures)
 
 
+def record_cost(predictions: Predictions) -> Predictions:
+    """Return predictions whose description of the detector tells what this process took, as ``cost``.
+
+    ``cost`` holds median and 95th percentile of the time per image (ms), peak memory of a process (MiB; None if the
+    system does not tell), and the machine.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> run = kpbench.predict(kpbench.open_dataset("kpbench-data"), "sift")
+    >>> sorted(kpbench.detectors.record_cost(run.predictions).detector["cost"])
+    ['machine', 'ms_median', 'ms_p95', 'peak_mib']
+    """
+    ms = np.zeros(0) if predictions.ms is None else predictions.ms[np.isfinite(predictions.ms)]
+    median, high = (round(float(v), 3) for v in np.quantile(ms, (0.5, 0.95))) if len(ms) else (None, None)
+    machine = f"{platform.system()} {platform.machine()}, {count_cores()} cores"
+    cost = {"ms_median": median, "ms_p95": high, "peak_mib": peak_mib(), "machine": machine}
+    return replace(predictions, detector=predictions.detector | {"cost": cost})
+
+
 def _pass_on(
     sink: Sink | None, detector: LoadedDetector, source: Dataset | CocoDataset | ImageSource
 ) -> Callable[[list[ImageResult], list[str], Int], None]:
@@ -287,7 +309,7 @@ def detect_images(
     dataset: Dataset | CocoDataset,
     detector: str | LoadedDetector,
     threshold: float | None,
-    positions: range,
+    positions: Sequence[int],
     progress: Progress,
 ) -> dict[int, ImageResult]:
     """Run a detector over some images of a dataset.
@@ -296,7 +318,7 @@ def detect_images(
 
     Parameters
     ----------
-    positions : range
+    positions : sequence of int
         Positions of the images in the dataset.
 
     Returns

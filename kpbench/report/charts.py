@@ -12,18 +12,32 @@ from typing import TypeVar
 
 from kpbench.text import escape_markup
 
-CHART_COLOURS = 9
+LIGHT_COLOURS = (
+    "#0067a8", "#c2410c", "#00795a", "#8d5fc4", "#a16207", "#be185d", "#3f7f93", "#5b6470", "#6f4518",
+)  # fmt: skip
+"""Line colours on white. Colour-blind readers can tell them apart (after Okabe and Ito 2008)."""
+DARK_COLOURS = (
+    "#5cb3ec", "#f59361", "#3fc79a", "#c3a2f0", "#e0b13c", "#f283b3", "#8ccbdd", "#aab3bf", "#cf9f6e",
+)  # fmt: skip
+"""The same on near-black."""
+CHART_COLOURS = len(LIGHT_COLOURS)
 """Number of line colours, which have the CSS classes s0 to s8. Further series reuse the colours with dashed lines."""
-# Colour-blind readers can tell the colours apart on white and on near-black (after Okabe and Ito 2008)
-CHART_STYLE = """\
-:root{--s0:#0067a8;--s1:#c2410c;--s2:#00795a;--s3:#8d5fc4;--s4:#a16207;--s5:#be185d;--s6:#3f7f93;--s7:#5b6470;--s8:#6f4518}
-@media (prefers-color-scheme:dark){:root{--s0:#5cb3ec;--s1:#f59361;--s2:#3fc79a;--s3:#c3a2f0;--s4:#e0b13c;--s5:#f283b3;\
---s6:#8ccbdd;--s7:#aab3bf;--s8:#cf9f6e}}
+
+
+def _colour_variables(colours: Sequence[str]) -> str:
+    return ";".join(f"--s{n}:{colour}" for n, colour in enumerate(colours))
+
+
+CHART_STYLE = (
+    f":root{{{_colour_variables(LIGHT_COLOURS)}}}\n"
+    f"@media (prefers-color-scheme:dark){{:root{{{_colour_variables(DARK_COLOURS)}}}}}\n"
+    """\
 svg.chart{font:12px system-ui,sans-serif;color:inherit;width:100%;max-width:600px;height:auto;display:block}
 .chart text{fill:currentColor}.chart .grid{stroke:currentColor;stroke-opacity:.15}
 .chart .axis{stroke:currentColor;stroke-opacity:.5}.chart polyline{fill:none;stroke-width:2;stroke-linejoin:round}
 .chart .dashed{stroke-dasharray:5 4}.chart .band{stroke:none;fill-opacity:.16}
 """ + "".join(f".s{n}{{stroke:var(--s{n});fill:var(--s{n})}}" for n in range(CHART_COLOURS))
+)
 """Style sheet (CSS) for all charts of a page."""
 
 # Sizes and positions are in SVG user units; a browser shows a chart at most 600 px wide
@@ -67,6 +81,37 @@ class Series:
     interval: Sequence[tuple[float, float] | None] | None = None
     style: int = 0
     dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Lines over one pair of axes.
+
+    Attributes
+    ----------
+    series : tuple of Series
+    x_label, y_label : str
+        Labels of the axes, with their units.
+    y_range : (low, high) or None
+        None: from 0 to a little over the largest value.
+    x_ticks : tuple of float
+        Positions of the numbers on the x-axis.
+    log_x : bool
+        Whether the x-axis is logarithmic.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> kpbench.report.Panel((kpbench.report.Series("a", [1, 2], [0.9, 0.7]),), "blur (px)", "score").log_x
+    False
+    """
+
+    series: tuple[Series, ...]
+    x_label: str
+    y_label: str
+    y_range: tuple[float, float] | None = None
+    x_ticks: tuple[float, ...] = ()
+    log_x: bool = False
 
 
 def line_chart(
@@ -144,18 +189,19 @@ def _draw_series(
     colour = f"s{s.style % CHART_COLOURS}"
     dashed = " dashed" if s.dashed or s.style >= CHART_COLOURS else ""
     intervals = s.interval or [None] * len(s.x)
+    name = f'data-series="{escape_markup(s.name)}"'
     parts = []
     for run in _split_at_gaps(zip(s.x, intervals, strict=True)):
         upper = [f"{to_px(x):.1f},{to_py(i[1]):.1f}" for x, i in run]
         lower = [f"{to_px(x):.1f},{to_py(i[0]):.1f}" for x, i in run[::-1]]
-        parts.append(f'<polygon class="band {colour}" points="{" ".join(upper + lower)}"/>')
+        parts.append(f'<polygon {name} class="band {colour}" points="{" ".join(upper + lower)}"/>')
     for line in _split_at_gaps(zip(s.x, s.y, strict=True)):
         points = " ".join(f"{to_px(x):.1f},{to_py(y):.1f}" for x, y in line)
-        parts.append(f'<polyline class="{colour}{dashed}" points="{points}"/>')
+        parts.append(f'<polyline {name} class="{colour}{dashed}" points="{points}"/>')
     for x, y, i in zip(s.x, s.y, intervals, strict=True) if markers else ():
         if y is not None:
             text = f"{s.name}: {y:.3f}" + (f" [{i[0]:.3f}, {i[1]:.3f}]" if i else "") + f" at {x:g}"
-            dot = f'<circle class="{colour}" cx="{to_px(x):.1f}" cy="{to_py(y):.1f}" r="3">'
+            dot = f'<circle {name} class="{colour}" cx="{to_px(x):.1f}" cy="{to_py(y):.1f}" r="3">'
             parts.append(f"{dot}<title>{escape_markup(text)}</title></circle>")
     return parts
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from kpbench.report.charts import Series, bar_chart, line_chart
+from kpbench.report.charts import Panel, Series, bar_chart, line_chart
 from kpbench.report.paper import PAPER, paper_value
 from kpbench.report.score_tables import get_estimate
 from kpbench.report.tables import Estimate
@@ -27,6 +27,8 @@ class Figure:
         The chart, an ``<svg>`` element.
     legend : tuple of (name, style)
         Name and colour index of each series.
+    lines : bool
+        Whether the chart has a line per name of the legend, which a page can switch off.
 
     Examples
     --------
@@ -38,6 +40,7 @@ class Figure:
     caption: str
     svg: str
     legend: tuple[tuple[str, int], ...] = ()
+    lines: bool = False
 
 
 def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detection_score") -> Figure:
@@ -59,6 +62,16 @@ def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detect
     >>> kpbench.report.severity_chart([scores], "blur").caption
     'blur: detection score'
     """
+    panel = severity_panel(runs, condition, metric)
+    svg = line_chart(
+        panel.series, panel.x_label, panel.y_label, y_range=panel.y_range, x_ticks=panel.x_ticks, log_x=panel.log_x
+    )
+    legend = tuple((s.name, s.style) for s in panel.series)
+    return Figure(f"{condition}: {LABELS[metric]}", svg, legend, lines=True)
+
+
+def severity_panel(runs: Sequence[Scores], condition: str, metric: str = "detection_score") -> Panel:
+    """Return the lines and axes of :func:`severity_chart`."""
     series = []
     for n, run in enumerate(runs):
         rungs = run.conditions.get(condition, [])
@@ -71,15 +84,8 @@ def severity_chart(runs: Sequence[Scores], condition: str, metric: str = "detect
     ticks = sorted({x for s in series for x in s.x})
     label = f"{paper.title} ({paper.unit})" if paper and paper.unit else paper.title if paper else condition
     bounded = metric not in ("average_false_alarm", "average_false_alarm_literal") and not metric.startswith("error")
-    svg = line_chart(
-        series,
-        label,
-        LABELS[metric],
-        y_range=(0.0, 1.0) if bounded else None,
-        x_ticks=ticks,
-        log_x=min(ticks, default=0) > 0 and max(ticks) / min(ticks) > 20,
-    )
-    return Figure(f"{condition}: {LABELS[metric]}", svg, tuple((s.name, s.style) for s in series))
+    log_x = min(ticks, default=0) > 0 and max(ticks) / min(ticks) > 20
+    return Panel(tuple(series), label, LABELS[metric], (0.0, 1.0) if bounded else None, tuple(ticks), log_x)
 
 
 def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
@@ -91,7 +97,7 @@ def precision_recall_chart(runs: Sequence[Scores]) -> Figure:
     svg = line_chart(
         series, "recall", "precision", y_range=(0.0, 1.0), x_ticks=(0, 0.2, 0.4, 0.6, 0.8, 1), markers=False
     )
-    return Figure("Precision and recall over all thresholds", svg, tuple((s.name, s.style) for s in series))
+    return Figure("Precision and recall over all thresholds", svg, tuple((s.name, s.style) for s in series), lines=True)
 
 
 def eps_chart(runs: Sequence[Scores]) -> Figure:
@@ -103,7 +109,7 @@ def eps_chart(runs: Sequence[Scores]) -> Figure:
     label = f"ε, in radii ({runs[0].settings.eps_radius})"
     ticks = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
     svg = line_chart(series, label, LABELS["detection_score"], y_range=(0.0, 1.0), x_ticks=ticks, log_x=True)
-    return Figure("Detection score over ε", svg, tuple((s.name, s.style) for s in series))
+    return Figure("Detection score over ε", svg, tuple((s.name, s.style) for s in series), lines=True)
 
 
 def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
@@ -127,7 +133,7 @@ def radius_chart(runs: Sequence[Scores], metric: str) -> Figure:
         x_ticks=ticks,
         log_x=True,
     )
-    return Figure(f"{LABELS[metric]} by radius", svg, tuple((s.name, s.style) for s in series))
+    return Figure(f"{LABELS[metric]} by radius", svg, tuple((s.name, s.style) for s in series), lines=True)
 
 
 def taxonomy_charts(runs: Sequence[Scores]) -> tuple[Figure, Figure]:

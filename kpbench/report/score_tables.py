@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 
 from kpbench.report.paper import SYNTHETIC, PaperTable, paper_value
 from kpbench.report.tables import Cell, Estimate, Table
-from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.breakpoints import DETECTION_SCORE_LIMIT, Breakpoint, find_breakpoints
 from kpbench.scoring.comparison import COMPARED_METRICS, Comparison
-from kpbench.scoring.groups import Group, GroupKey
+from kpbench.scoring.groups import Group
 from kpbench.scoring.metrics import LABELS, PAPER_METRICS
 from kpbench.scoring.scores import Scores
-from kpbench.scoring.uncertainty import UNCERTAINTY_METRICS
 
 SHORT_LABELS = dict(zip(PAPER_METRICS, ("detection", "ID matching", "false alarms"), strict=True))
 """Labels of the paper's metrics in narrow columns."""
@@ -41,6 +38,8 @@ def overview_table(runs: Sequence[Scores]) -> Table:
     rows = [(run.name, *(get_estimate(run.overall, metric) for metric in metrics)) for run in runs]
     failed = [f"{run.name} failed on {len(f)} images" for run in runs if (f := run.detector.get("failures"))]
     note = f"{', '.join(failed)}, which count as no detections." if failed else ""
+    versions = [f"{run.name} {run.detector['version']}" for run in runs if run.detector.get("version")]
+    note = " ".join(filter(None, (note, f"Versions: {', '.join(versions)}." if versions else "")))
     return Table("All images", ("detector", *(LABELS[m] for m in metrics)), tuple(rows), note)
 
 
@@ -233,52 +232,6 @@ def confusion_table(run: Scores, patches: Mapping[int, str]) -> Table:
     return Table(f"IDs of matched detections: {run.name}", ("true", *names, "other"), rows, shade=True)
 
 
-def bias_table(runs: Sequence[Scores], patches: Mapping[int, str] | None = None) -> Table:
-    """Tabulate bias, scatter, predicted standard deviation and NEES: a row per detector, and per detector and patch.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
-    >>> kpbench.report.bias_table([scores]).rows[0][:2]
-    ('oracle', 'all')
-    """
-    metrics = ("error_rms_px", *UNCERTAINTY_METRICS)
-    rows: list[tuple[Cell, ...]] = []
-    for run in runs:
-        for group in (run.overall, *(g for g in run.by if g.key == GroupKey(patch_id=g.patch_id))):
-            patch = "all" if group.patch_id is None else str((patches or {}).get(group.patch_id, group.patch_id))
-            rows.append((run.name, patch, group.counts["matched"], *(get_estimate(group, name) for name in metrics)))
-    note = (
-        "Bias is the mean error of matched keypoints in the frame of the patch, so biases of different patches may "
-        "cancel in the row of all. NEES is 2 where the predicted covariances are right, and more where they are too "
-        "small."
-    )
-    columns = ("detector", "patch", "matched", *(LABELS[name] for name in metrics))
-    return Table("Bias and uncertainty", columns, tuple(rows), note)
-
-
-def nees_table(run: Scores) -> Table:
-    """Tabulate the NEES in each quintile of the predicted standard deviation, one row per quintile."""
-    rows = tuple(
-        (f"{low:.3g} to {high:.3g}", part["matched"], Estimate(part["nees"], part["interval"]))
-        for part in run.nees_by_sigma
-        for low, high in [part["sigma_px"]]
-    )
-    return Table(f"NEES by predicted sigma: {run.name}", ("predicted sigma (px)", "matched", LABELS["nees"]), rows)
-
-
-def reliability_table(run: Scores) -> Table:
-    """Tabulate the reliability curve of the scores of detections, one row per bin of scores."""
-    rows = tuple(
-        (f"{low:.1f} to {high:.1f}", part["detections"], part["score_mean"], part["precision"])
-        for part in run.reliability["bins"]
-        for low, high in [part["score"]]
-    )
-    title = f"Calibration of the score: {run.name}, ECE {run.reliability['ece']:.3f}"
-    return Table(title, ("score", "detections", "mean score", "precision"), rows)
-
-
 def verdict_table(comparisons: Sequence[Comparison]) -> Table:
     """Tabulate differences over all images, and verdicts counted over rungs: a row per other detector and metric.
 
@@ -299,8 +252,9 @@ def verdict_table(comparisons: Sequence[Comparison]) -> Table:
     name = comparisons[0].first
     columns = ("against", "metric", name, "the other", "difference", "over all images", "rungs better", "even", "worse")
     note = (
-        "A difference is called better or worse when its paired 95 % interval does not contain 0. Between equal "
-        "detectors, chance makes about 5 rungs in 100 better or worse."
+        "A rung is better or worse if its paired 95 % interval does not contain 0 and its p-value, adjusted for all "
+        "rungs by Holm's method, is at most 0.05. Between equal detectors, chance makes any rung better or worse in "
+        "at most 5 of 100 comparisons."
     )
     return Table(f"{name} against the others", columns, tuple(rows), note)
 
@@ -322,32 +276,3 @@ def difference_table(comparison: Comparison) -> Table:
     names = [LABELS[d.metric] for d in comparison.differences[: len(COMPARED_METRICS)]]
     title = f"{comparison.first} minus {comparison.second}"
     return Table(title, ("condition", "rung", *names), tuple((*key, *cells) for key, cells in cells_of.items()))
-
-
-def pose_table(run: Scores, groups: Sequence[PoseGroup]) -> Table:
-    """Tabulate errors of the board's pose: a row for all images, then a row per condition and rung.
-
-    Parameters
-    ----------
-    run : Scores
-    groups : sequence of PoseGroup
-        The result of :func:`kpbench.scoring.group_pose_errors`.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
-    >>> group = kpbench.scoring.PoseGroup(None, None, 6, 6, 0.1, 0.4, 0.3, 1.2)
-    >>> kpbench.report.pose_table(scores, [group]).rows[0][:4]
-    ('all', 'all', 6, 6)
-    """
-    rows = []
-    for group in groups:
-        _, _, *cells = astuple(group)
-        rung = "all" if group.rung is None else f"{group.rung:g}"
-        rows.append((group.condition or "all", rung, *cells))
-    percentiles = ("median", "95th percentile")
-    errors = [f"{error}, {percentile}" for error in ("translation (%)", "rotation (°)") for percentile in percentiles]
-    columns = ("condition", "rung", "images", "with a pose", *errors)
-    note = "A pose needs at least four matched keypoints. Translation is in % of the board's distance from the camera."
-    return Table(f"Pose of the board: {run.name}", columns, tuple(rows), note)

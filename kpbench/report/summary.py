@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from kpbench.report.score_tables import (
-    difference_table,
-    group_table,
-    nees_table,
-    pose_table,
-    reliability_table,
-    verdict_table,
-)
+from kpbench.report.detail_tables import nees_table, pose_table, reliability_table
+from kpbench.report.score_tables import difference_table, group_table, verdict_table
 from kpbench.report.tables import Estimate, Table, cell_text, to_plain
 from kpbench.scoring.board_pose import PoseGroup
 from kpbench.scoring.comparison import Comparison

@@ -1,4 +1,7 @@
-"""Tables as data, and as text for a terminal, Markdown and LaTeX. The HTML form is in ``templates/report.html``."""
+"""Tables as data, and as text for a terminal and Markdown.
+
+LaTeX is in :mod:`kpbench.report.latex`, the HTML form in ``templates/report.html``.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from kpbench.scoring.bootstrap import Interval
-from kpbench.text import escape_latex, escape_markdown, escape_terminal
+from kpbench.text import escape_markdown, escape_terminal
 
 
 class Estimate(NamedTuple):
@@ -113,39 +116,3 @@ def to_markdown(table: Table) -> str:
     lines = [f"**{escape(table.title)}**", "", line([*map(escape, table.columns)]), line(["---"] * len(table.columns))]
     lines += [line([*map(escape, row)]) for row in table.rows]
     return "\n".join([*lines, *(["", escape(table.note)] if table.note else []), ""])
-
-
-def to_latex(table: Table) -> str:
-    r"""Write a LaTeX ``table`` environment that needs no package.
-
-    The first column is aligned to the left, all other columns to the right.
-
-    Examples
-    --------
-    >>> import kpbench
-    >>> text = kpbench.report.to_latex(kpbench.report.Table("Scores", ("detector", "score"), (("a_b", 0.5),)))
-    >>> print(text.splitlines()[7])
-    a\_b & 0.500 \\
-    """
-
-    def line(cells: Sequence[str]) -> str:
-        return f"{' & '.join(map(escape_latex, cells))} \\\\"
-
-    body = [line([cell_text(cell) for cell in row]) for row in table.rows]
-    caption = escape_latex(f"{table.title}. {table.note}" if table.note else table.title)
-    return "\n".join(
-        [
-            r"\begin{table}",
-            r"\centering",
-            f"\\caption{{{caption}}}",
-            f"\\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
-            r"\hline",
-            line(table.columns),
-            r"\hline",
-            *body,
-            r"\hline",
-            r"\end{tabular}",
-            r"\end{table}",
-            "",
-        ]
-    )

@@ -28,6 +28,7 @@ from kpbench.scoring.groups import Group, GroupKey, as_written, make_groups
 from kpbench.scoring.metrics import SUMS, count_above_thresholds
 from kpbench.scoring.outcomes import Outcomes, Settings, match_predictions
 from kpbench.scoring.reliability import compute_reliability
+from kpbench.scoring.slices import compute_slices
 from kpbench.scoring.uncertainty import compute_nees_by_sigma
 from kpbench.types import Detections, Predictions, Truth
 
@@ -136,6 +137,11 @@ class Scores:
         """The calibration of the score over all images: :func:`kpbench.scoring.reliability.compute_reliability`."""
         return compute_reliability(self.outcomes.detections.score, self.outcomes.matches.kind == MATCHED)
 
+    @cached_property
+    def slices(self) -> list[dict[str, Any]]:
+        """The detection score by tilt, contrast and visible share: :func:`kpbench.scoring.slices.compute_slices`."""
+        return compute_slices(self.outcomes)
+
     def rows(self) -> list[dict[str, Any]]:
         """Return a flat table: a row over all images, then a row per group.
 
@@ -196,6 +202,7 @@ class Scores:
             "eps_curve": self.eps_curve,
             "nees_by_sigma": self.nees_by_sigma,
             "reliability": self.reliability,
+            "slices": self.slices,
         }
 
 

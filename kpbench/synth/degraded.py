@@ -253,8 +253,9 @@ class DegradeConfig:
 
 
 def is_degradation(condition: Condition) -> bool:
-    """Return whether a condition consists of effects on an image alone: no pose, camera, film or board of its own."""
-    own = condition.pose or condition.camera or condition.film or condition.board != "hexagon"
+    """Return whether a condition consists of effects on an image alone: no view, camera, film or board of its own."""
+    c = condition
+    own = c.pose or c.camera or c.film or c.clutter or c.paper_px2 or c.board != "hexagon"
     return bool(condition.effects) and not own
 
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.degrade.effects import Effect, occlusion_cover
-from kpbench.degrade.ladder import apply_effects
+from kpbench.degrade.effects import Effect, polygon_cover
+from kpbench.degrade.ladder import OUTLINES_OF_COVER, apply_effects
 from kpbench.geometry.coverage import clip_to_image
 from kpbench.render.placement import Placement
 from kpbench.render.scene import Mask, Rendering, fraction_inside, keypoint_table, measure_contrast, rasterise_patches
@@ -99,12 +99,12 @@ def unoccluded_fraction(image: UInt8, effects: Sequence[Effect], masks: Sequence
     -------
     ndarray of shape (n,), float64
     """
-    occlusions = [effect["strips"] for effect in effects if effect["effect"] == "occlusion"]
+    covers = [OUTLINES_OF_COVER[e["effect"]](e) for e in effects if e["effect"] in OUTLINES_OF_COVER]
     fraction = np.ones(len(masks))
-    for n, mask in enumerate(masks) if occlusions else ():
+    for n, mask in enumerate(masks) if covers else ():
         _, in_box = clip_to_image(mask.box, image)
         uncovered = disc = mask.disc[in_box]
-        for strips in occlusions:
-            uncovered = uncovered * (1 - occlusion_cover(strips, mask.box))[in_box]
+        for outlines in covers:
+            uncovered = uncovered * (1 - polygon_cover(outlines, mask.box))[in_box]
         fraction[n] = uncovered.sum() / max(disc.sum(), 1e-9)
     return fraction

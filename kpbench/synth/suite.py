@@ -23,9 +23,11 @@ from kpbench.patches.tag_boards import TAG_BOARDS, tag_board
 from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.board_projection import Pose, pose_board
 from kpbench.render.board_view import Appearance, board_keypoints, render_board
+from kpbench.render.lookalikes import draw_lookalikes
 from kpbench.seeds import (
     SUITE_BACKGROUND,
     SUITE_CAMERA,
+    SUITE_CLUTTER,
     SUITE_EFFECT,
     SUITE_FIELD,
     SUITE_FILM,
@@ -36,7 +38,7 @@ from kpbench.seeds import (
 from kpbench.synth.camera_view import expose_board, needs_colour, photograph_board
 from kpbench.synth.film import FILM_KEYS, draw_bar, draw_path, film_record
 from kpbench.synth.finish import degrade_scene, discs_of
-from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, suite_boards
+from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, printed_share, suite_boards
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.synth.suite_view import View
 from kpbench.types import Float
@@ -248,6 +250,9 @@ class SuiteConfig:
         rng = stage_rng(self.seed, scene_id, SUITE_SCENE)
         drawn = {key: float(rng.uniform(*span)) for key, span in self.suite.scene}
         drawn |= {key: values[step] for key, values in condition.pose}
+        if condition.paper_px2:
+            board_px2 = condition.paper_px2[step] / printed_share(board)
+            drawn["area_percent"] = 100 * board_px2 / (self.camera.width_px * self.camera.height_px)
         preset = self.presets[rung]
         taken = None if preset is None else preset.draw(stage_rng(self.seed, scene_id, SUITE_CAMERA))
         camera = replace(self.camera, distortion=(taken["k1"], 0.0, 0.0, 0.0)) if taken and taken["k1"] else self.camera
@@ -298,6 +303,7 @@ class SuiteConfig:
         view = self.view(index)
         taken = view.taken
         background = self._find_background(view.scene_id, 3 if taken and needs_colour(taken) else 1)
+        background = self._add_clutter(background, index, view.scene_id)
         if taken and view.exposed:
             shot = view.scene_id * self._frames + index % self._frames
             rng = stage_rng(self.seed, shot, SUITE_SENSOR)
@@ -316,6 +322,16 @@ class SuiteConfig:
             scene_id=view.scene_id,
         )
         return sample, background.broken_files
+
+    def _add_clutter(self, background: Background, index: int, scene_id: int) -> Background:
+        """Return the background with the look-alikes of the image's rung."""
+        condition, step = self.rungs[index // self._frames // self.scenes // len(self.boards)]
+        if not condition.clutter:
+            return background
+        image, rng = background.image.copy(), stage_rng(self.seed, scene_id, SUITE_CLUTTER)
+        height, width = image.shape[:2]
+        draw_lookalikes(image, rng, round(condition.clutter[step] * width * height / 1e6), self.suite.patches)
+        return replace(background, image=image)
 
     def _find_background(self, scene_id: int, channels: int) -> Background:
         """Return the background of a base scene from the cache, or make the background.
@@ -352,4 +368,7 @@ def describe_condition(condition: Condition) -> dict[str, Any]:
         described["film"] = {key: list(values) for key, values in condition.film}
     if condition.camera:
         described["camera"] = {key: list(values) for key, values in condition.camera}
+    for key in ("clutter", "paper_px2"):
+        if values := getattr(condition, key):
+            described[key] = list(values)
     return described | ({} if condition.board == "hexagon" else {"board": condition.board})

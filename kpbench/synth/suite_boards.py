@@ -12,7 +12,7 @@ from kpbench.geometry.camera import Camera
 from kpbench.geometry.homography import project
 from kpbench.patches.board import Board, BoardLike, hexagon_board, single_board
 from kpbench.patches.design import Patch, parse_patch, shipped_patches
-from kpbench.patches.tag_boards import tag_board
+from kpbench.patches.tag_boards import TAGS_PER_BOARD, TagBoard, tag_board
 from kpbench.portable import cos_sin
 from kpbench.types import Float
 
@@ -52,6 +52,29 @@ def mixed_board(patches: Sequence[Patch]) -> Board:
     hexagon = hexagon_board(patches[0], BOARD_SIDE_MM)
     keypoints = tuple(replace(k, patch=patches[n % len(patches)]) for n, k in enumerate(hexagon.keypoints))
     return replace(hexagon, name="mixed", keypoints=keypoints)
+
+
+def printed_share(board: BoardLike) -> float:
+    """Return the printed area per keypoint, as a share of the board: what a keypoint costs on paper.
+
+    A patch counts with its disc. A tag counts with its black square, without the white margin that it needs. A ChArUco
+    pattern counts with its rectangle of squares.
+
+    Examples
+    --------
+    >>> from kpbench.patches import tag_board
+    >>> from kpbench.synth.suite_boards import printed_share
+    >>> round(printed_share(tag_board("apriltag", 187.5)), 4)
+    0.0443
+    """
+    if isinstance(board, TagBoard):
+        rows, columns = np.flatnonzero(board.black.any(axis=1)), np.flatnonzero(board.black.any(axis=0))
+        modules = float((np.ptp(rows) + 1) * (np.ptp(columns) + 1))
+        if board.name != "charuco":
+            modules = TAGS_PER_BOARD * ((len(board.black) - 1) / TAGS_PER_BOARD - 1) ** 2
+        return modules / len(board.black) ** 2 / len(board.keypoints)
+    area_mm2 = sum(np.pi * k.H_patch2board[0, 0] ** 2 for k in board.keypoints)
+    return float(area_mm2 / (board.side_x_mm * board.side_y_mm) / len(board.keypoints))
 
 
 def disc_outline(board: BoardLike) -> Float:

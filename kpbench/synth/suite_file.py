@@ -17,9 +17,11 @@ from kpbench.toml import TomlTable, name_source, read_toml
 
 SUITE_SCHEMA = "kpbench.suite/1"
 SUITE_KEYS = ("schema", "name", "images", "patches", "camera", "scene", "condition", "film")
-CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board", "film")
+CONDITION_KEYS = ("name", "unit", "rungs", "pose", "effects", "camera", "board", "film", "clutter", "paper_px2")
 BOARDS = ("hexagon", "single")
 """Boards of patches of a condition: :func:`kpbench.hexagon_board`, or one patch almost as large as the board."""
+MOST_CLUTTER = 10_000
+"""Largest number of look-alikes per megapixel."""
 SCENE_KEYS = {
     "area_percent": (0.01, 90.0),
     "pitch_deg": (-80.0, 80.0),
@@ -69,6 +71,11 @@ class Condition:
     film : tuple of (str, tuple of float)
         Quantities of :data:`kpbench.synth.film.FILM_KEYS`, each with one value per rung; empty if the suite has no
         films.
+    clutter : tuple of float
+        Look-alikes on the background, per megapixel of the image, one value per rung; empty for none.
+    paper_px2 : tuple of float
+        Printed area per keypoint, px², one value per rung: the board is as near as this needs, see
+        :func:`kpbench.synth.suite_boards.printed_share`. Empty: the scene's ``area_percent`` sets the distance.
 
     Examples
     --------
@@ -86,6 +93,8 @@ class Condition:
     camera: CameraLevels = ()
     board: str = "hexagon"
     film: Levels = ()
+    clutter: tuple[float, ...] = ()
+    paper_px2: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -154,7 +163,7 @@ def shipped_suites() -> dict[str, Path]:
     --------
     >>> from kpbench.synth import shipped_suites
     >>> list(shipped_suites())
-    ['camera-v1', 'extended-v1', 'paper-v1', 'video-v1']
+    ['camera-v1', 'extended-v1', 'extended-v2', 'paper-v1', 'video-v1']
     """
     return shipped_files("suites")
 
@@ -229,6 +238,8 @@ def _parse_condition(table: TomlTable) -> Condition:
         camera=tuple((key, _parse_camera_levels(camera, key, len(rungs))) for key in camera.values),
         board=table.choice("board", BOARDS, "hexagon"),
         film=tuple((key, film.numbers(key, *FILM_BOUNDS[key], len(rungs))) for key in FILM_KEYS if film.values),
+        clutter=table.numbers("clutter", 0, MOST_CLUTTER, len(rungs)) if "clutter" in table else (),
+        paper_px2=table.numbers("paper_px2", 1, 1e7, len(rungs)) if "paper_px2" in table else (),
     )
 
 

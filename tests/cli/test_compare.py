@@ -40,7 +40,7 @@ def test_the_command_tells_who_is_better_and_exits(here):
 
 def test_wrong_usage(here):
     assert "expected two or more predictions files" in kpbench("compare", "good.json", code=2).stderr
-    refused = kpbench("compare", "a.json", "b.json", "--report", "x.pdf", code=2)
+    refused = kpbench("compare", "a.json", "b.json", "--report", "x.doc", code=2)
     assert "expected a file ending in .html, .md, .tex" in refused.stderr
 
 

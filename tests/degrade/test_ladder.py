@@ -12,10 +12,11 @@ from kpbench.degrade.effects import (
     low_light,
     noise,
     occlusion,
-    occlusion_cover,
+    polygon_cover,
     shadow_edge,
+    strip_corners,
 )
-from kpbench.degrade.ladder import EFFECT_FUNCTIONS, LADDER, apply_effects, draw_effect
+from kpbench.degrade.ladder import EFFECT_FUNCTIONS, LADDER, OUTLINES_OF_COVER, apply_effects, draw_effect
 from kpbench.errors import DataError
 from kpbench.filters import gaussian_taps
 from kpbench.geometry.coverage import rasterise
@@ -161,7 +162,7 @@ def test_a_shadow_edge_takes_its_share_of_light_on_one_side():
 def test_occlusion_hides_the_share_it_says(level):
     discs = np.array([[50.3, 60.1, 20.0], [130.0, 60.0, 12.5]])
     recorded = draw_effect(np.random.default_rng(0), "occlusion", level, (180, 120), discs)
-    cover = occlusion_cover(recorded["strips"], (0, 0, 180, 120))
+    cover = polygon_cover(strip_corners(recorded["strips"]), (0, 0, 180, 120))
     angles = np.radians(np.arange(360))
     for x, y, radius in discs:
         rim = np.column_stack([x + radius * np.cos(angles), y + radius * np.sin(angles)])
@@ -169,7 +170,7 @@ def test_occlusion_hides_the_share_it_says(level):
         assert np.isclose((disc * cover).sum() / disc.sum(), level / 100, atol=0.01)
     image = np.full((120, 180), 255, np.uint8)
     assert ((occlusion(image, recorded["strips"]) < 255) == (cover > 1 / 255)).mean() > 0.999
-    part = occlusion_cover(recorded["strips"], (40, 30, 50, 60))
+    part = polygon_cover(strip_corners(recorded["strips"]), (40, 30, 50, 60))
     assert np.allclose(part, cover[30:90, 40:90])
 
 
@@ -207,3 +208,38 @@ def test_a_dimmed_picture_by_the_printed_law_is_black():
 def test_a_level_that_makes_no_sense_is_told(effect, level, says):
     with pytest.raises(DataError, match=says):
         draw_effect(np.random.default_rng(0), effect, level, (160, 120))
+
+
+# --- hands and cables ---------------------------------------------------------------------------------------------
+
+BOARD = np.array([[x, y, 16.0] for x, y in ((120, 80), (180, 80), (210, 120), (180, 160), (120, 160), (90, 120))])
+
+
+@pytest.mark.parametrize("effect", ["hand", "cable"])
+def test_a_limb_hides_what_its_outline_covers_and_more_with_the_level(effect):
+    image, shares = np.full((240, 300), 128, np.uint8), []
+    for level in LADDER[effect].levels:
+        record = draw_effect(np.random.default_rng(4), effect, level, (300, 240), BOARD)
+        cover = polygon_cover(OUTLINES_OF_COVER["limbs"](record), (0, 0, 300, 240))
+        drawn = apply_effects(image, np.random.default_rng(0), [record]) != 128
+        assert (drawn <= (cover > 0)).all()
+        assert drawn[cover > 0.999].mean() > 0.9  # some limbs are as grey as the image
+        shares.append(cover.mean())
+    assert shares == sorted(shares)
+    assert shares[-1] > 1.5 * shares[0]
+
+
+def test_more_cables_keep_the_first_ones():
+    one, four = (draw_effect(np.random.default_rng(4), "cable", n, (300, 240), BOARD)["limbs"] for n in (1, 4))
+    assert four[: len(one)] == one
+    assert len(four) == 4 * len(one)
+
+
+def test_a_limb_is_the_hull_of_two_discs():
+    [outline] = OUTLINES_OF_COVER["limbs"]({"limbs": [[10.0, 20.0, 60.0, 20.0, 8.0, 4.0, 0.0]]})
+    assert np.allclose([outline[:, 0].min(), outline[:, 0].max()], [2, 64], atol=0.1)
+    area = abs(np.sum(outline[:, 0] * np.roll(outline[:, 1], -1) - np.roll(outline[:, 0], -1) * outline[:, 1])) / 2
+    grid = np.stack(np.meshgrid(np.arange(0, 70, 0.25), np.arange(0, 40, 0.25)), -1)
+    t = np.linspace(0, 1, 400)[:, None, None]
+    inside = (np.hypot(grid[..., 0] - (10 + 50 * t), grid[..., 1] - 20) <= 8 - 4 * t).any(axis=0)
+    assert np.isclose(area, inside.sum() / 16, rtol=0.01)

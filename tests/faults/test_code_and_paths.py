@@ -35,7 +35,10 @@ PLANTED = (
         "h5py",
         "jinja2",
         "lazy_loader",
+        "locus",
+        "matplotlib",
         "msgspec",
+        "napa_vision",
     ),
     *(
         "numpy",

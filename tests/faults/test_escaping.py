@@ -20,9 +20,11 @@ from kpbench.cli.messages import clean_usage_error, echo
 from kpbench.dataset.card import write_card
 from kpbench.dataset.folder import make_manifest, write_manifest
 from kpbench.errors import KpbenchWarning
-from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report
+from kpbench.report.latex import to_latex
+from kpbench.report.report import to_html, to_latex_report, to_markdown_report
 from kpbench.report.result_files import encode_scores_csv
-from kpbench.report.tables import Estimate, Table, to_latex, to_markdown, to_plain
+from kpbench.report.sections import Report
+from kpbench.report.tables import Estimate, Table, to_markdown, to_plain
 from kpbench.text import escape_csv, escape_csv_comment, escape_latex, escape_markdown, escape_terminal
 from kpbench.types import KEYPOINT_DTYPE, Truth
 
@@ -151,7 +153,7 @@ def test_tables_keep_their_rows_and_columns(text):
     table = Table(text, (text, "n"), ((text, 1), ("b", 2)), text)
     assert [len(re.split(r"(?<!\\)\|", line)) for line in to_markdown(table).split("\n")[2:6]] == [4] * 4
     assert len(to_plain(table).split("\n")) == 3
-    assert to_latex(table).count("\n") == 12
+    assert to_latex(table).count("\n") == 13
 
 
 @pytest.mark.parametrize("name", EVIL.values(), ids=EVIL)

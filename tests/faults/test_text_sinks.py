@@ -28,8 +28,9 @@ from kpbench.printing.page import Page, Text
 from kpbench.printing.pdf import to_pdf
 from kpbench.printing.svg import to_svg
 from kpbench.report.charts import Series, bar_chart, line_chart
-from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report
+from kpbench.report.report import to_html, to_latex_report, to_markdown_report
 from kpbench.report.result_files import encode_scores, encode_scores_csv
+from kpbench.report.sections import Report
 from kpbench.text import FORMULA, escape_csv, escape_dxf, escape_terminal, escape_yaml, replace_unprinted
 
 IMAGES = [[(3, 4, 2, 0), (6, 2, 2, 1)], [(5, 5, 2, 2)]]

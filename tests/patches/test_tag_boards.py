@@ -1,3 +1,5 @@
+from importlib.util import find_spec
+
 import cv2
 import numpy as np
 import pytest
@@ -12,8 +14,17 @@ from kpbench.render.board_view import Appearance, board_keypoints, render_board
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
 
+OPTIONAL = {"napa": "napa_vision", "locus": "locus"}
+
+
+def needs(module):
+    return pytest.mark.skipif(find_spec(module) is None, reason=f"{module} is not installed")
+
+
 CAMERA = Camera(640, 480, 350.3)
 BOARDS = [tag_board(name, 187.5) for name in TAG_BOARDS]
+DETECTORS = [*TAG_BOARDS, *(pytest.param(name, marks=needs(module)) for name, module in OPTIONAL.items())]
+BOARD_OF = {"napa": "apriltag", "locus": "apriltag"}
 SCENE = np.full((480, 640), 90, np.uint8)
 
 
@@ -30,16 +41,16 @@ def test_a_board_of_tags_is_like_a_board_of_patches(board):
     assert not edge.any()  # a white module all round
 
 
-@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.name)
+@pytest.mark.parametrize("name", DETECTORS)
 @pytest.mark.parametrize("lens", [(0.0,) * 5, (-0.2, 0.05, 0.0, 0.0, 0.0)])
-def test_its_detector_finds_every_corner_where_the_truth_is(board, lens):
+def test_its_detector_finds_every_corner_where_the_truth_is(name, lens):
     """Convention of pixels, order of corners and identities of three libraries, in any pose."""
-    camera = Camera(640, 480, 350.3, lens)
+    camera, board = Camera(640, 480, 350.3, lens), tag_board(BOARD_OF.get(name, name), 187.5)
     off = []
     for n, pitch_deg in enumerate((0, 40, -30)):
         pose = pose_board(camera, board, 20, pitch_deg=pitch_deg, roll_deg=25 + 80 * n, shift=(0.05, -0.05))
         image = render_board(SCENE, camera, pose, board, Appearance(30, 220, light=0.9, slope=(0.1, 0))).image
-        found = load_detector(board.name)(cv2.GaussianBlur(image, (0, 0), 0.7))
+        found = load_detector(name)(cv2.GaussianBlur(image, (0, 0), 0.7))
         truth = board_keypoints(camera, pose, board)
         order = [int(np.flatnonzero(found.patch_id == k["patch_id"])[0]) for k in truth]
         assert len(order) == len(found)
@@ -48,7 +59,7 @@ def test_its_detector_finds_every_corner_where_the_truth_is(board, lens):
     assert abs(np.concatenate(off).mean(axis=0)).max() < 0.15  # a library that counts from pixel corners: 0.5
 
 
-@pytest.mark.parametrize("name", TAG_BOARDS)
+@pytest.mark.parametrize("name", DETECTORS)
 def test_nothing_is_found_where_nothing_is(name):
     found = load_detector(name)(SCENE)
     assert (len(found), found.patch_id is None) == (0, False)

@@ -7,23 +7,30 @@ import socketserver
 import subprocess
 import threading
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
+from kpbench.detectors.prediction import record_cost
 from kpbench.errors import DataError
-from kpbench.report.charts import Series, bar_chart, line_chart
+from kpbench.report.charts import LIGHT_COLOURS, Series, bar_chart, line_chart
+from kpbench.report.detail_tables import cost_table
+from kpbench.report.latex import to_latex
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
-from kpbench.report.report import Report, to_html, to_latex_report, to_markdown_report, write_report
+from kpbench.report.report import to_html, to_latex_report, to_markdown_report, write_report
 from kpbench.report.result_files import encode_scores, encode_scores_csv
 from kpbench.report.score_charts import severity_chart
 from kpbench.report.score_tables import paper_table
-from kpbench.report.tables import Estimate, Table, to_latex, to_markdown, to_plain
+from kpbench.report.sections import Report, name_runs
+from kpbench.report.tables import Estimate, Table, to_markdown, to_plain
 from kpbench.report.worst_cases import pick_worst_cases
 from kpbench.scoring.breakpoints import find_breakpoints
+from kpbench.scoring.comparison import compare
 from kpbench.scoring.scores import score
-from kpbench.types import KEYPOINT_DTYPE, Detections, Truth
+from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions, Truth
+from kpbench.writing import HEAD_BYTES, TAIL_BYTES, kind_of
 
 SHARE = {3: 1.0, 7: 0.95, 11: 0.5, 15: 0.25}  # of keypoints found at each rung
 
@@ -104,8 +111,9 @@ def test_markdown_keeps_its_columns():
 
 def test_latex_is_escaped():
     text = to_latex(TABLE)
-    assert r"\caption{A \& B. 100 \% \{n\}}" in text
+    assert r"\caption{A \& B. 100 \% \{n\} Sub- and superscripts are 95 \% intervals.}\label{tab:a-b}" in text
     assert r"name & a\textbar{}b & x\_y \\" in text
+    assert r"p\textbar{}q & $0.250\sb{0.125}\sp{0.500}$ & 3 \\" in text
     assert r"$\varepsilon$ & 0.0004 & 2.000 \\" in text
     assert text.count(r"\begin{tabular}{lrr}") == text.count(r"\end{tabular}") == 1
 
@@ -278,8 +286,103 @@ def test_several_detectors_share_every_table(scores):
 
 
 def test_an_unknown_suffix_is_one_line(report, tmp_path):
-    with pytest.raises(DataError, match=r"r\.pdf: unknown kind of report, expected \.html, \.md, \.tex"):
-        write_report(tmp_path / "r.pdf", report)
+    known = r"\.html, \.md, \.tex, \.pdf, \.png, \.svg"
+    with pytest.raises(DataError, match=rf"r\.doc: unknown kind of report, expected {known}"):
+        write_report(tmp_path / "r.doc", report)
+
+
+# --- LaTeX that fits --------------------------------------------------------------------------------------------
+
+
+def latex_document(latex):
+    head = r"\documentclass{article}\usepackage{booktabs,longtable}\begin{document}"
+    return f"{head}\n{latex}\n\\end{{document}}\n"
+
+
+def wide_report():
+    names = ("superpoint-small", "template", "a detector with a name that is long")
+    shares = {float(rung): 0.5 for rung in range(1, 14)}
+    runs = [replace(score(*ladder(2, shares), resamples=20), name=name) for name in names]
+    return Report(tuple(runs), comparisons=tuple(compare(runs[0], run) for run in runs[1:]))
+
+
+def test_no_table_of_a_latex_report_is_wider_than_the_page():
+    """Widths of Computer Modern at 8 pt, and of its sub- and superscripts at 6 pt, as Matplotlib measures them."""
+    pytest.importorskip("matplotlib")
+    latex = to_latex_report(wide_report())
+    tables = re.findall(r"\\begin\{(?:tabular|longtable)\}\{([lr]+)\}(.*?)\\end\{(?:tabular|longtable)\}", latex, re.S)
+    assert len(tables) > 10
+    for columns, body in tables:
+        rows = [row.split(" & ") for row in body.splitlines() if " & " in row]
+        assert {len(row) for row in rows} == {len(columns)}
+        widths = [max(width_pt(row[n]) for row in rows) for n in range(len(columns))]
+        assert sum(widths) + 6 * len(columns) <= 345, rows[0]
+    labels = re.findall(r"\\label\{([^}]*)\}", latex)
+    assert all(re.fullmatch("tab:[a-z0-9-]+", label) for label in labels)
+
+
+def width_pt(cell):
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextToPath
+
+    font = TextToPath()
+
+    def measure(text, size):
+        return font.get_text_width_height_descent(text, FontProperties(family="cmr10", size=size), False)[0]
+
+    text = cell.removesuffix(r" \\").strip("$")
+    if text.startswith("\\parbox"):
+        return float(re.search(r"\{(\d+)pt\}", text)[1])
+    if text.startswith("\\shortstack"):
+        return max(measure(line, 8) for line in text[text.index("{") + 1 : -1].split(r"\\"))
+    value, _, bounds = text.partition(r"\sb")
+    return measure(value, 8) + max((measure(b, 6) for b in re.findall(r"\{([^}]*)\}", bounds)), default=0.0)
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="needs pdflatex")
+def test_a_latex_report_compiles_without_an_overfull_box(tmp_path):
+    (tmp_path / "r.tex").write_text(latex_document(to_latex_report(wide_report())))
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "r.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout[-2000:]
+    assert "Overfull" not in (tmp_path / "r.log").read_text()
+
+
+# --- figures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("suffix", "start"), [(".pdf", b"%PDF-"), (".png", b"\x89PNG"), (".svg", b"<?xml")])
+def test_a_figure_shows_each_line_in_its_colour_and_may_be_replaced(report, tmp_path, suffix, start):
+    pytest.importorskip("matplotlib")
+    file = tmp_path / f"severity{suffix}"
+    write_report(file, report)
+    first = file.read_bytes()
+    assert first.startswith(start)
+    assert kind_of(first[:HEAD_BYTES], first[-TAIL_BYTES:]) == "report"
+    write_report(file, report)
+    assert file.read_bytes() == first
+    if suffix == ".svg":
+        ET.fromstring(first)
+        assert all(f"stroke: {LIGHT_COLOURS[style]}".encode() in first for style in (0, 7))
+
+
+def test_a_figure_needs_conditions(tmp_path):
+    plain = score(*ladder(1, {3: 1.0}, condition=""), resamples=0)
+    with pytest.raises(DataError, match=r"f\.svg: the images have no conditions, so there is no severity curve"):
+        write_report(tmp_path / "f.svg", Report((plain,)))
+
+
+def test_names_of_detectors(scores):
+    versioned = replace(scores, name="net 0050e9b5")
+    versioned.outcomes.detector.update(name="net", version="0050e9b5")
+    try:
+        assert [run.name for run in name_runs([versioned])] == ["net"]
+        assert [run.name for run in name_runs([versioned, versioned])] == ["net 0050e9b5"] * 2
+        assert [run.name for run in name_runs([versioned, versioned], ["a", "b"])] == ["a", "b"]
+        with pytest.raises(DataError, match="expected 2 different names, one per predictions file"):
+            name_runs([versioned, versioned], ["a", "a"])
+    finally:
+        versioned.outcomes.detector.clear()
 
 
 def test_the_scores_file_holds_breakpoints_and_csv_says_what_it_is_of(scores):
@@ -355,6 +458,14 @@ for (const table of document.querySelectorAll("table")) {
     }
   });
 }
+const toggle = document.querySelector("[data-toggle]"), figure = toggle.closest("figure");
+const line = figure.querySelector("polyline"), chart = figure.querySelector("svg.chart");
+const box = chart.getBoundingClientRect();
+toggle.click(); out.off = getComputedStyle(line).display; toggle.click(); out.on = getComputedStyle(line).display;
+const move = () => chart.dispatchEvent(new PointerEvent("pointermove", {clientX: box.right - 5, clientY: box.top + 9}));
+move(); out.read = figure.querySelector(".readout").textContent;
+figure.querySelector("[data-zoom]").click(); out.zoomed = chart.getAttribute("viewBox");
+figure.querySelector("[data-zoom='0']").click(); out.whole = chart.getAttribute("viewBox");
 out.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
 out.drawn = [...document.querySelectorAll(".case image")].every(i => i.getBBox().width > 0);
 document.body.textContent = "PROBE" + JSON.stringify(out) + "PROBE";
@@ -407,6 +518,9 @@ def test_the_page_works_in_a_browser_without_network(report, tmp_path, width):
     assert probe["galleries"] == 12
     assert probe["drawn"]
     assert probe["wrong"] == []
+    assert (probe["off"], probe["on"]) == ("none", "inline")
+    assert probe["read"].startswith("detector: 0.250")
+    assert (probe["zoomed"] != probe["whole"], probe["whole"]) == (True, "0 0 480 300")
     assert probe["focus"] == probe["sorts"] > 20
     assert probe["wide"] <= 0  # tables scroll in their own boxes, the page never sideways
 
@@ -418,3 +532,18 @@ def test_the_browser_test_would_see_a_request_and_an_error(tmp_path):
     _, console, asked = browse(page, tmp_path / "profile")
     assert len(console) == 2
     assert any("http://kpbench.invalid/x.png" in line for line in asked)
+
+
+# --- time and memory --------------------------------------------------------------------------------------------
+
+
+def test_what_a_detector_took_stands_in_the_report_of_its_predictions(scores):
+    assert cost_table([scores]).rows == ()
+    found = Predictions.from_detections([Detections.none()] * 2, [0, 1], {"name": "a"}, "", ms=[2.0, 4.0])
+    cost = record_cost(found).detector["cost"]
+    assert (cost["ms_median"], cost["machine"]) == (3.0, cost["machine"])
+    assert cost["peak_mib"] is None or 10 < cost["peak_mib"] < 10**5
+    told = score(Truth(**{**vars(ladder(1, {3: 1.0})[0])}), [Detections.none()], resamples=0)
+    told.outcomes.detector.update(cost={"ms_median": 3.0, "ms_p95": [], "machine": "<x>"})
+    assert cost_table([told]).rows == (("detector", 3.0, "[]", None, "<x>"),)
+    assert "Time and memory" in to_markdown_report(Report((told,)))

@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from kpbench.report.charts import LIGHT_COLOURS
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
+from kpbench.writing import HEAD_BYTES, kind_of
 
 ROOT = Path(__file__).parents[2]
 RESULTS = sorted((ROOT / "benchmarks" / "results").glob("*/*.json"))
@@ -46,6 +48,14 @@ def test_the_leaderboard_and_the_findings_are_made_of_the_results():
     findings = (ROOT / "docs" / "results" / "findings.md").read_text()
     runs = leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")
     assert leaderboard.findings(findings, runs) == findings
-    text, picture = leaderboard.page(ROOT / "benchmarks" / "results")
+    text, _ = leaderboard.page(ROOT / "benchmarks" / "results")
     assert (ROOT / "docs" / "results" / "leaderboard.md").read_text() == text
-    assert (ROOT / "docs" / "results" / "severity.svg").read_text() == picture
+
+
+def test_the_figure_of_the_leaderboard_shows_every_detector_in_its_colour():
+    runs = leaderboard.load(ROOT / "benchmarks" / "results" / "paper-v1")
+    drawn = (ROOT / "docs" / "results" / "severity.svg").read_text()
+    assert kind_of(drawn[:HEAD_BYTES].encode()) == "report"
+    for colour in LIGHT_COLOURS[: min(len(runs) + 1, len(LIGHT_COLOURS))]:
+        assert f"stroke: {colour}" in drawn  # in the element itself: librsvg knows no variables
+    assert (ROOT / "docs" / "results" / "severity.pdf").read_bytes()[:5] == b"%PDF-"

@@ -8,8 +8,8 @@ import pytest
 
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
+from kpbench.report.detail_tables import pose_table
 from kpbench.report.result_files import encode_scores
-from kpbench.report.score_tables import pose_table
 from kpbench.scoring.board_pose import PoseErrors, compute_pose_errors, group_pose_errors
 from kpbench.scoring.scores import score
 from kpbench.synth.suite import SuiteConfig

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from kpbench.errors import DataError, GateFailed
-from kpbench.report.report import Report, to_html, to_markdown_report
+from kpbench.report.report import to_html, to_markdown_report
+from kpbench.report.sections import Report
 from kpbench.scoring.comparison import COMPARED_METRICS, check_regression, compare
 from kpbench.scoring.scores import score
 from kpbench.types import KEYPOINT_DTYPE, Detections, Predictions, Truth

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from kpbench.report.report import Report, to_markdown_report
+from kpbench.report.report import to_markdown_report
+from kpbench.report.sections import Report
 from kpbench.report.summary import summarise_scores
 from kpbench.scoring.reliability import compute_reliability
 from kpbench.scoring.scores import score

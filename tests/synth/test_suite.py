@@ -1,6 +1,7 @@
 import hashlib
 import json
 import pickle
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,7 +13,9 @@ from kpbench.dataset.generation import generate
 from kpbench.degrade.blurs import blur
 from kpbench.errors import DataError
 from kpbench.render.background import procedural_background
+from kpbench.render.board_projection import polygon_area, project_outline
 from kpbench.synth.suite import SuiteConfig
+from kpbench.synth.suite_boards import printed_share
 from kpbench.synth.suite_file import load_suite, shipped_suites
 
 SMALL = (203, 155)
@@ -50,7 +53,12 @@ def truth_digest(suite, scenes=2):
 
 @pytest.mark.parametrize(
     ("name", "digest"),
-    [("paper-v1", "ada17e3c064af31d"), ("extended-v1", "8044ad33e95e77b6"), ("camera-v1", "ea5e0c3b21008ef0")],
+    [
+        ("paper-v1", "ada17e3c064af31d"),
+        ("extended-v1", "8044ad33e95e77b6"),
+        ("extended-v2", "394421757a0cf7dc"),
+        ("camera-v1", "ea5e0c3b21008ef0"),
+    ],
 )
 def test_a_published_suite_never_changes(name, digest):
     """If this fails, the change makes a new suite, such as paper-v2; a frozen one keeps its truth."""
@@ -75,7 +83,7 @@ def test_the_papers_conditions_are_the_papers():
         "noise": (15, 30, 45, 60),
     }
     assert SuiteConfig(load_suite("paper-v1")).n == 26 * 4 * 500
-    assert sorted(shipped_suites()) == ["camera-v1", "extended-v1", "paper-v1", "video-v1"]
+    assert sorted(shipped_suites()) == ["camera-v1", "extended-v1", "extended-v2", "paper-v1", "video-v1"]
 
 
 def test_one_scene_is_the_same_under_every_rung_and_patch():
@@ -245,3 +253,28 @@ def test_a_background_is_made_once_though_every_rung_shows_it(tmp_path, monkeypa
     config = SuiteConfig(load_suite("paper-v1"), images=6, size_px=(64, 64), only=("blur",), shard_size=3)
     assert len(generate(config, tmp_path / "a", workers=1).dataset) == 6 * 4 * 4
     assert len(made) == 6
+
+
+def test_patches_and_tags_cost_the_same_paper():
+    """Under `paper`, the printed area per keypoint is the rung's: of a disc, or of a tag that has four corners."""
+    for board in (None, "apriltag", "charuco"):
+        made = config("extended-v2", only=("paper",), images=1, board=board, size_px=(640, 480))
+        for n in range(len(made.rungs)):
+            view = made.view(n * len(made.boards))
+            area_px2 = polygon_area(project_outline(view.camera, view.pose, view.board))
+            assert np.isclose(area_px2 * printed_share(view.board), view.rung, rtol=0.01)
+
+
+def test_clutter_lies_behind_the_board_and_grows():
+    made = config("extended-v2", only=("clutter+defocus",), images=1, board="apriltag", size_px=(640, 480))
+    cluttered = replace(made.rungs[0][0], effects=())
+    assert cluttered.clutter == (500, 1500, 4000)
+    shown, clean = (
+        replace(made, suite=replace(made.suite, conditions=(condition,)))
+        for condition in (cluttered, replace(cluttered, clutter=()))
+    )
+    changed = [clean.make(n)[0].image != shown.make(n)[0].image for n in range(3)]
+    shares = [c.mean() for c in changed]
+    assert 0.02 < shares[0] < shares[1] < shares[2] < 0.97
+    x, y = clean.make(0)[0].keypoints[["x", "y"]][0]
+    assert not changed[2][round(y) - 3 : round(y) + 4, round(x) - 3 : round(x) + 4].any()

@@ -18,6 +18,7 @@ import kpbench
 import kpbench.predictions
 import kpbench.synth
 import kpbench.training
+from kpbench.benchmark.rerun import read_scores_json
 from kpbench.camera import load_camera_preset
 
 from . import binary_references, reading, references, seeds
@@ -114,6 +115,10 @@ ALL_READERS = (
     Reader(
         "coco-results", "input.json", seeds.coco_results, of_json("image_id", "category_id", "score"),
         kpbench.read_predictions, json.loads, references.predictions_json, share=1.5,
+    ),
+    Reader(
+        "scores", "input.json", seeds.scores, of_json("suite", "name", "fingerprint", "sha256", "config"),
+        read_scores_json, json.loads, imports=DATA,
     ),
     Reader(
         "manifest", "dataset.json", seeds.manifests,

@@ -168,6 +168,14 @@ def patches() -> list[bytes]:
     return [as_json(tree) for tree in (*trees, trees[0] | with_rim)]
 
 
+def scores() -> list[bytes]:
+    """Scores files of a suite, with the parts that the verification of a submission reads."""
+    config = {"suite": "paper-v1", "images": 1, "seed": 0, "size_px": [203, 155], "conditions": [], "backgrounds": {}}
+    provenance = {"config": config, "predictions": [{"file": "a.json", "sha256": "0" * 64}]}
+    about = {"detector": {"name": "orb", "version": "1"}, "dataset": {"fingerprint": "0" * 64, "images": 1}}
+    return [as_json({"schema": "kpbench.scores/1", **about, "metrics": {}, "by": [], "provenance": provenance})]
+
+
 def boards() -> list[bytes]:
     grid = {
         "name": "grid",
