@@ -61,17 +61,19 @@ class DesignPage:
         self.is_busy = False
         with ui.element("section").classes("kp-card"):
             ui.html("<h2>Design</h2>", sanitize=False)
-            shipped = {patch.patch_id: f"start from {patch.name}" for patch in shipped_patches()}
-            ui.select(shipped, label="Start", on_change=lambda event: self.start_from(event.value)).classes("w-full")
-            self.controls = ui.column().classes("w-full").style("gap: 8px")
+            shipped = {patch.patch_id: patch.name for patch in shipped_patches()}
+            ui.select(shipped, label="Start from", on_change=lambda event: self.start_from(event.value)).classes(
+                "kp-full"
+            )
+            self.controls = ui.column().classes("kp-full").style("gap: 8px")
             add = partial(self.edit, add_semicircle, True)
             ui.button("Add a semi-circle", icon="add", on_click=add).props("outline")
             self.problem = ui.label().classes("kp-problem").props('role="alert"')
         with ui.element("div").classes("kp-stack"):
             with ui.element("section").classes("kp-card kp"):
                 ui.html("<h2>As a camera sees it</h2>", sanitize=False)
-                with ui.row().style("gap: 20px"):
-                    self.drawing = ui.html("", sanitize=False).props('data-kp="drawing"')
+                with ui.element("div").classes("kp-row").style("align-items: flex-start"):
+                    self.drawing = ui.html("", sanitize=False).classes("kp-drawing")
                     self.previews = ui.html("", sanitize=False).props('data-kp="previews"')
                 ui.label("Rows: radius of the disc. Tilted by 60°, noise of 40 grey levels.").classes("kp-note")
             with ui.element("section").classes("kp-card kp"):
@@ -87,16 +89,18 @@ class DesignPage:
         width: dict[str, Any] = {"min": 0, "max": 2, "step": 0.05}
         self.controls.clear()
         with self.controls:
-            with ui.element("div").classes("kp-row w-full"):
+            with ui.element("div").classes("kp-row kp-full"):
                 self._bind(ui.input("Name", value=design.name), "name")
                 self._bind(ui.number("ID", value=design.patch_id, min=0, max=32767, precision=0), "patch_id")
                 self._bind(ui.select(inks, label="Disc", value=design.disc), "disc")
-            with ui.element("div").classes("kp-row w-full"):
+            with ui.element("div").classes("kp-row kp-full"):
                 self._bind(ui.number("Rim (radii)", value=design.rim, **width), "rim")
                 self._bind(ui.select(inks, label="Ink of the rim", value=design.rim_ink), "rim_ink")
                 self._bind(ui.number("Quiet zone (radii)", value=design.quiet_zone, **width), "quiet_zone")
             for n in range(len(design.semicircles)):
-                with ui.element("div").classes("kp-arc w-full").props(f'role="group" aria-label="semi-circle {n + 1}"'):
+                with (
+                    ui.element("div").classes("kp-arc kp-full").props(f'role="group" aria-label="semi-circle {n + 1}"')
+                ):
                     self._make_semicircle(n)
 
     def _bind(self, control: Any, key: str) -> None:
@@ -199,7 +203,8 @@ class DesignPage:
         with ui.element("section").classes("kp-card kp"):
             ui.html("<h2>Print</h2>", sanitize=False)
             with ui.element("div").classes("kp-row"):
-                self._field(ui.select(SHEET_NAMES, label="Sheet", value=choice.sheet), "sheet")
+                sheet = ui.select(SHEET_NAMES, label="Sheet", value=choice.sheet)
+                self._field(sheet, "sheet")
                 self._field(ui.select(DESIGN_CHOICES, label="Designs", value=choice.designs), "designs")
                 self._field(
                     ui.number("Diameter (mm)", placeholder="usual", value=choice.diameter_mm, min=0.1, max=5000),
@@ -209,10 +214,12 @@ class DesignPage:
             with ui.element("div").classes("kp-row"):
                 for key, title, most in (
                     ("copies", "Copies", 1000),
-                    ("rows", "Rows (field)", 100),
-                    ("columns", "Columns (field)", 100),
+                    ("rows", "Rows", 100),
+                    ("columns", "Columns", 100),
                 ):
-                    self._field(ui.number(title, value=getattr(choice, key), min=1, max=most, precision=0), key)
+                    number = ui.number(title, value=getattr(choice, key), min=1, max=most, precision=0)
+                    self._field(number, key)
+                    number.bind_visibility_from(sheet, "value", value="patches" if key == "copies" else "field")
                 self._field(ui.number("PNG: dots per inch", value=choice.dpi, min=36, max=1200, precision=0), "dpi")
             with ui.element("div").classes("kp-row"):
                 for key, title in SWITCHES.items():

@@ -39,14 +39,14 @@ class DetectPage:
         with ui.element("div").classes("kp-stack"):
             self._make_source()
             self._make_look()
+        with ui.element("div").classes("kp-stack"):
+            self._make_picture()
             with ui.element("section").classes("kp-card"):
                 ui.html("<h2>Points</h2>", sanitize=False)
                 columns = [
                     {"name": key, "label": label, "field": key, "align": "left"} for key, label in COLUMNS.items()
                 ]
-                self.table = ui.table(rows=[], columns=columns, row_key="n").classes("w-full").props("dense flat")
-        with ui.element("div").classes("kp-stack"):
-            self._make_picture()
+                self.table = ui.table(rows=[], columns=columns, row_key="n").classes("kp-full").props("dense flat")
             with ui.element("section").classes("kp-card") as self.plot_card:
                 ui.html("<h2>Pose over time</h2>", sanitize=False)
                 self.plot = (
@@ -70,9 +70,9 @@ class DetectPage:
         with ui.element("section").classes("kp-card"):
             ui.html("<h2>Look for</h2>", sanitize=False)
             detectors = [OWN_DETECTOR, *DETECTORS]
-            self.detector = ui.select(detectors, label="Detector", value=desk.detector).classes("w-full")
+            self.detector = ui.select(detectors, label="Detector", value=desk.detector).classes("kp-full")
             self.detector.on_value_change(lambda e: self.look(detector=e.value))
-            self.board = ui.select(desk.board_names(), label="Board", value=desk.board_name).classes("w-full")
+            self.board = ui.select(desk.board_names(), label="Board", value=desk.board_name).classes("kp-full")
             self.board.on_value_change(lambda e: self.look(board_name=e.value))
             with ui.element("div").classes("kp-row"):
                 self.camera = ui.select(desk.camera_names(), label="Camera", value=desk.camera_name).classes("kp-grow")
@@ -89,12 +89,12 @@ class DetectPage:
     def _make_picture(self) -> None:
         with ui.element("section").classes("kp-card"):
             ui.html("<h2>Picture</h2>", sanitize=False)
-            self.photos = ui.select({}, label="Photograph", on_change=lambda e: self.choose(e.value)).classes("w-full")
+            self.photos = ui.select({}, label="Photograph", on_change=lambda e: self.choose(e.value)).classes("kp-full")
             with (
                 ui.element("div").classes("kp-picture").props('role="img" aria-label="the picture with what was found"')
             ):
-                self.empty = ui.label("Nothing yet. Drop a photograph of printed patches on the left.").classes(
-                    "kp-empty w-full"
+                self.empty = ui.label("Nothing yet: drop a photograph of printed patches, or open a camera.").classes(
+                    "kp-empty kp-full"
                 )
                 self.image = ui.interactive_image()
             self.status = ui.label().classes("kp-note").props('data-kp="status"')
@@ -195,7 +195,7 @@ class DetectPage:
             self.show_figures(sight)
         else:
             self.shown = (number, self.shown[1])
-        self.freeze.visible = watcher.is_film
+        self.freeze.visible = watcher.is_film and watcher.is_running
         self.freeze.text, self.freeze.icon = ("Go on", "play_arrow") if watcher.is_frozen else ("Freeze", "pause")
         self.status.text = self.describe(sight)
 
@@ -256,7 +256,7 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
         on_multi_upload=take,
         on_rejected=refuse,
     )
-    upload.classes("w-full").props(f'flat bordered accept="{",".join(suffixes)}"')
+    upload.classes("kp-full").props(f'flat bordered accept="{",".join(suffixes)}"')
     button = ui.button("Choose files", icon="folder_open").props("outline").props(f'aria-label="choose files: {text}"')
     button.on("click", js_handler=f"() => getElement({upload.id}).pickFiles()")
     return upload

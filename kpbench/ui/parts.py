@@ -19,6 +19,10 @@ TITLES = {"/": "Design and print", "/detect": "Detect and live"}
 """Title of each page, by address."""
 STYLE = """
 :root { --line: #8886; --soft: #8881; }
+body { --q-primary: #1a66a8 !important; }
+body.body--dark { --q-primary: #74b6f2 !important; }
+.q-header { background: #1d3a55; }
+.kp-full { width: 100%; }
 body { font-size: 15px; }
 .nicegui-content { padding: 0; }
 main.kp { width: 100%; max-width: 1500px; margin: 0 auto; padding: 16px; display: grid; gap: 16px; align-items: start; }
@@ -43,7 +47,11 @@ main.kp > *, .kp-stack > * { min-width: 0; }
 .kp table.previews { border-spacing: 8px; }
 .kp table.previews img { width: 84px; height: 84px; image-rendering: pixelated; display: block; border-radius: 4px; }
 .kp table.previews th { font-weight: 400; font-size: 13.5px; }
-.kp-drawing svg { width: 100%; max-width: 300px; background: #fff; border-radius: 8px; display: block; }
+.kp-drawing img { width: 240px; max-width: 100%; display: block; border-radius: 6px; }
+.kp-card .q-uploader { width: 100%; max-height: none; border: 2px dashed var(--line); background: none; }
+.kp-card .q-uploader__header { background: none; color: inherit; }
+.kp-card .q-uploader__title { line-height: 1.3; font-size: 15px; white-space: normal; }
+.kp-card :is(.q-uploader__subtitle, .q-uploader__list, .q-uploader__header .q-btn) { display: none; }
 .kp-sheet { background: #fff; border: 1px solid var(--line); max-width: 380px; width: 100%; }
 .kp-picture { width: 100%; background: var(--soft); border-radius: 6px; overflow: hidden; }
 .kp-empty { min-height: 180px; display: flex; align-items: center; justify-content: center; text-align: center;
@@ -54,6 +62,8 @@ main.kp > *, .kp-stack > * { min-width: 0; }
 @media (max-width: 820px) {
   main.kp.two { grid-template-columns: minmax(0, 1fr); }
   main.kp { padding: 10px; }
+  .kp-nav { flex-wrap: nowrap; gap: 0; }
+  .kp-nav a { padding: 6px; font-size: 14px; white-space: nowrap; }
   .kp table.previews { border-spacing: 3px; }
   .kp table.previews img { width: 66px; height: 66px; }
 }

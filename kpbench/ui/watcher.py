@@ -236,7 +236,8 @@ class Watcher:
                 try:
                     self._look_at(open_images(source), shown, look, stop)
                 except KpbenchError as error:
-                    self.problems.append(str(error).replace(source, shown))
+                    line = str(error).replace(source, shown)
+                    self.problems.append(line if shown in line else f"{shown}: {line}")
                 except Exception as error:  # a damaged file can make OpenCV raise anything
                     self.problems.append(one_line(f"{shown}: {type(error).__name__}: {error}"))
                 if stop.is_set():
@@ -256,6 +257,7 @@ class Watcher:
             frame = (index, time_s) if index >= 0 else (None, None)
             start_s += self._thaw(stop) if is_film else 0.0
             early_s = start_s + (frame[1] or 0.0) - time.monotonic()
+            start_s -= min(early_s, 0.0)  # what is late stays late, and does not hurry
             if stop.is_set() or (early_s > 0 and stop.wait(early_s)):
                 return
             if image is None:
@@ -311,7 +313,7 @@ def _detect(image: UInt8, place: Place, detector: LoadedDetector, look: Look, tr
     """Look for patches in an image, and for the board among them. ``tracker`` only draws the pose."""
     size_px, start_s = (image.shape[1], image.shape[0]), time.perf_counter()
     detections = detector(image)
-    record = PoseRecord(*place, "", None, "no board is looked for")
+    record = PoseRecord(*place, "", None, "no board is chosen")
     if look.board is not None:
         of_image = Predictions.from_detections([detections], [place[0]], size=[size_px])
         [record, *_] = locate_boards(of_image, [look.board], look.camera_for(image))[1]
