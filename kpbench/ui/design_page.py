@@ -35,7 +35,7 @@ from kpbench.ui.designer import (
     print_files,
 )
 from kpbench.ui.desk import Desk
-from kpbench.ui.parts import figures_table, in_worker
+from kpbench.ui.parts import QuickSlider, figures_table, in_worker
 
 DRAWING_RADIUS_PX = 120.0
 """Radius of the disc in the large drawing, px."""
@@ -124,7 +124,7 @@ class DesignPage:
         """Make a number and a slider for one value of a semi-circle. The number takes any value, the slider some."""
         with ui.element("div").classes("kp-row").style("flex-wrap: nowrap"):
             number = ui.number(title, value=value, step=step, format="%.6g").props("dense").style("width: 96px")
-            slider = ui.slider(min=low, max=high, step=step, value=value).classes("kp-grow")
+            slider = QuickSlider(min=low, max=high, step=step, value=value).classes("kp-grow")
             slider.props(f'aria-label="{title} of semi-circle {n + 1}"')
         slider.on_value_change(lambda event: number.set_value(event.value))
         number.on_value_change(lambda event: None if event.value is None else slider.set_value(event.value))

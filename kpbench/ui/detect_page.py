@@ -97,6 +97,7 @@ class DetectPage:
                     "kp-empty kp-full"
                 )
                 self.image = ui.interactive_image()
+            self.trouble = ui.label().classes("kp-problem").props('role="alert"')
             self.status = ui.label().classes("kp-note").props('data-kp="status"')
             self.pose = ui.label().props('data-kp="pose"').style("font-variant-numeric: tabular-nums")
             with ui.element("div").classes("kp-row"):
@@ -186,8 +187,7 @@ class DetectPage:
         if number != self.shown[0]:
             self.image.set_source("" if sight is None else f"/picture/{number}")
             self.empty.visible = sight is None
-        if watcher.problems:
-            self.problem.text = "; ".join(watcher.problems[:3])
+        self.trouble.text = "; ".join(watcher.problems[:3])
         is_due = time.monotonic() - self.drawn_s > TABLE_PERIOD_S
         if is_due and (number, len(watcher.kept)) != self.shown:
             self.drawn_s = time.monotonic()
@@ -258,7 +258,7 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
     )
     upload.classes("kp-full").props(f'flat bordered accept="{",".join(suffixes)}"')
     button = ui.button("Choose files", icon="folder_open").props("outline").props(f'aria-label="choose files: {text}"')
-    button.on("click", js_handler=f"() => getElement({upload.id}).pickFiles()")
+    button.on("click", js_handler=f"() => runMethod({upload.id}, 'pickFiles', [])")
     return upload
 
 

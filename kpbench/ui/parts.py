@@ -77,6 +77,12 @@ async def in_worker(function: Callable[..., Result], *arguments: object) -> Resu
     return await asyncio.get_running_loop().run_in_executor(_worker, lambda: function(*arguments))
 
 
+class QuickSlider(ui.slider):
+    """A slider that moves at once. NiceGUI's own waits for the server at each step, and loses steps meanwhile."""
+
+    LOOPBACK = False
+
+
 @contextmanager
 def page_frame(desk: Desk, address: str) -> Iterator[None]:
     """Make the frame of a page: its style, the header with links to the pages, and the switch for the dark."""

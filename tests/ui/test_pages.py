@@ -136,9 +136,10 @@ def test_a_patch_is_designed_and_printed(address, open_page, here):
     page.wait_for_selector('img[alt="the design checker"]')
     before = page.inner_html("[data-kp=previews]")
     page.get_by_role("button", name="Add a semi-circle").click()
+    page.get_by_role("group", name="semi-circle 3").wait_for()
     page.get_by_label("Name", exact=True).fill("mine")
     slider = page.get_by_role("slider", name="Start (°) of semi-circle 3")
-    slider.focus()
+    slider.locator("[tabindex]").focus()
     for _ in range(30):
         page.keyboard.press("ArrowRight")
     number = page.get_by_role("group", name="semi-circle 3").get_by_label("Start (°)").first
@@ -236,10 +237,10 @@ def test_bad_uploads_are_refused_in_one_line_each(address, open_page, here):
 
 
 def ask(address, method, path, **headers):
-    connection = http.client.HTTPConnection(address.split("/")[2], timeout=60)
-    connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    return answer.status, answer.read()
+    with contextlib.closing(http.client.HTTPConnection(address.split("/")[2], timeout=60)) as connection:
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        with connection.getresponse() as answer:
+            return answer.status, b"" if answer.status == 101 else answer.read()
 
 
 def test_requests_of_others_are_refused(address):
@@ -277,7 +278,7 @@ def test_live_opens_the_page_with_a_film(open_page, scene, tmp_path):
         assert url.endswith("/detect")
         page = open_page(url)
         status(page, "film.mp4, frame 5")
-        page.close()
+        page.goto("about:blank")
 
 
 def test_wrong_calls_are_one_line(scene, address):
