@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import mimetypes
 from collections.abc import Callable
 from urllib.parse import quote
 
 from fastapi import Response
-from nicegui import app, core, ui
+from nicegui import app, background_tasks, core, ui
+from nicegui.server import Server
 
 from kpbench.ui.design_page import DesignPage
 from kpbench.ui.desk import Desk
@@ -52,7 +54,12 @@ def run_application(
         with page_frame(desk, "/detect"):
             DetectPage(desk)
 
-    app.on_startup(lambda: started(f"http://{f'[{host}]' if ':' in host else host}:{port}{first_page}"))
+    async def announce() -> None:
+        while not Server.instance.started:
+            await asyncio.sleep(0.02)
+        started(f"http://{f'[{host}]' if ':' in host else host}:{port}{first_page}")
+
+    app.on_startup(lambda: background_tasks.create(announce()))
     ui.run(
         host=host,
         port=port,

@@ -64,10 +64,10 @@ def test_measures_are_those_of_the_analysis():
 
 CHOICES = {
     "patches": (PrintChoice(diameter_mm=25, copies=2, page="letter"), "--diameter-mm 25 --copies 2 --page letter"),
-    "hexagon": (PrintChoice("hexagon", page="a3", landscape=True), "--board hexagon --page a3 --landscape"),
-    "mirrored": (PrintChoice("hexagon", labels=False, mirror=True, invert=True, reference=True, page="a3"),
-                 "--board hexagon --no-labels --mirror --invert --reference --page a3"),
-    "tiles": (PrintChoice("grid", diameter_mm=60, tile=True), "--board grid --diameter-mm 60 --tile"),
+    "mirrored": (PrintChoice("hexagon", diameter_mm=12, labels=False, landscape=True, mirror=True, invert=True,
+                             reference=True),
+                 "--board hexagon --no-labels --landscape --mirror --invert --reference --diameter-mm 12"),
+    "tiles": (PrintChoice("grid", diameter_mm=40, tile=True), "--board grid --diameter-mm 40 --tile"),
     "field": (PrintChoice("field", "shipped", rows=5, columns=4), "--board field --rows 5 --columns 4"),
 }  # fmt: skip
 
@@ -77,10 +77,10 @@ def test_a_download_is_what_the_command_line_writes(name, here):
     choice, options = CHOICES[name]
     toml = download_of(OWN, choice, "toml")
     Path(toml[0]).write_bytes(toml[1])
-    given = f"{options} --dpi 72".split() + ([] if choice.designs == "shipped" else ["--design", toml[0]])
+    given = f"{options} --dpi 36".split() + ([] if choice.designs == "shipped" else ["--design", toml[0]])
     kpbench("render-patches", "--pdf", "--svg", "--png", "--dxf", "--out", "printed", *given)
     for form in ("pdf", "svg", "png", "dxf"):
-        file, content = download_of(OWN, replace(choice, dpi=72), form)
+        file, content = download_of(OWN, replace(choice, dpi=36), form)
         written = {path.name: path.read_bytes() for path in Path("printed").glob(f"*.{form}")}
         if file.endswith(".zip"):
             with zipfile.ZipFile(BytesIO(content)) as archive:
