@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -10,18 +11,21 @@ from pathlib import Path
 
 from kpbench.errors import DataError, KpbenchError
 from kpbench.files import read_text
+from kpbench.films import VIDEO_SUFFIXES
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.camera_file import read_camera
 from kpbench.patches.board import Board
 from kpbench.patches.board_file import load_board, load_boards
 from kpbench.patches.design import Patch, load_patch, shipped_patches
-from kpbench.ui.designer import PrintChoice, chosen_boards
+from kpbench.ui.designer import PrintChoice, chosen_boards, chosen_designs
 from kpbench.ui.watcher import Look, Watcher
 
 MOST_DOWNLOADS = 16
 """Number of the newest downloads that can be fetched."""
 OWN_DETECTOR = "template: my design"
 """The detector ``template``, for the edited design."""
+FILM_HEAD = re.compile(rb"RIFF....AVI |....(ftyp|moov|mdat|free|skip|wide|pnot)|\x1a\x45\xdf\xa3", re.DOTALL)
+"""How the films begin that a browser may send."""
 NO_BOARD, MY_BOARD, FILE_BOARD = "no board", "the board of the Design page", "a board's file"
 """Boards to look for, beside the shipped ones."""
 NO_CAMERA, VIEW_CAMERA, FILE_CAMERA = "no camera", "field of view", "a calibration"
@@ -138,7 +142,8 @@ class Desk:
                 self.design = load_patch(path)
                 return "design"
             if path.suffix == ".toml" or "kpbench.board" in text:
-                self.board, self.board_name = load_board(path), FILE_BOARD
+                designs = chosen_designs(self.design, PrintChoice(designs="mixed"))
+                self.board, self.board_name = load_board(path, designs), FILE_BOARD  # which may not name other files
                 return "board"
             self.camera, self.camera_name = read_camera(path), FILE_CAMERA
             return "camera"
@@ -146,7 +151,16 @@ class Desk:
             raise DataError(str(error).replace(str(path), name)) from None
 
     def drop(self, files: Sequence[tuple[str, Path]]) -> None:
-        """Look at photographs and films that a browser sent, instead of those before, whose files are deleted."""
+        """Look at photographs and films that a browser sent, instead of those before, whose files are deleted.
+
+        Raises
+        ------
+        DataError
+            If a file is named as a film, and is none. FFmpeg would take a list of other files for a film.
+        """
+        for name, path in files:
+            if path.suffix in VIDEO_SUFFIXES and not FILM_HEAD.match(_head(path)):
+                raise DataError(f"{name}: cannot be opened as a video, expected AVI, MP4, MOV, Matroska or WebM")
         self.watcher.close()
         for path in [Path(source) for _, source in self.sources]:
             if path.parent == self.folder:
@@ -164,6 +178,11 @@ class Desk:
     def fetch(self, key: str) -> tuple[str, bytes] | None:
         """Return name and content of a download, None if it is gone."""
         return self._downloads.get(key)
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(16)
 
 
 def _shipped_boards() -> list[Board]:

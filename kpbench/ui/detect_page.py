@@ -257,6 +257,7 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
         on_rejected=refuse,
     )
     upload.classes("kp-full").props(f'flat bordered accept="{",".join(suffixes)}"')
+    upload.on("failed", refuse, args=[])
     button = ui.button("Choose files", icon="folder_open").props("outline").props(f'aria-label="choose files: {text}"')
     button.on("click", js_handler=f"() => runMethod({upload.id}, 'pickFiles', [])")
     return upload

@@ -126,10 +126,15 @@ def test_a_desk_takes_files_by_what_they_hold(tmp_path):
     assert desk.look().camera.focal_px == track_scenes.CAMERA.focal_px
     with pytest.raises(DataError, match=r"^/etc/passwd: expected a file ending in \.json"):
         desk.place_for("/etc/passwd", (".json",))
-    bad = desk.place_for("bad.json", (".json",))
-    bad.write_text(json.dumps({"camera": 1}))
-    with pytest.raises(DataError, match=r"^bad\.json: "):
-        desk.take("bad.json", bad)
+    for name, content in (
+        ("bad.json", json.dumps({"camera": 1})),
+        ("bad.toml", 'designs = ["/etc/passwd"]\n[grid]\nrows = 2\ncolumns = 2\n'),
+    ):
+        bad = desk.place_for(name, (".json", ".toml"))
+        bad.write_text(content)
+        with pytest.raises(DataError, match=f"^{name}: ") as caught:
+            desk.take(name, bad)
+        assert "passwd" not in str(caught.value)
 
 
 def test_a_desk_looks_for_the_board_of_the_design_page(tmp_path):
@@ -142,6 +147,14 @@ def test_a_desk_looks_for_the_board_of_the_design_page(tmp_path):
     desk.choice = PrintChoice("hexagon")
     assert desk.look().board.name == "hexagon-trefoil"
     assert desk.look().view_deg == 65
+
+
+def test_a_list_of_files_is_no_film(tmp_path):
+    desk = Desk(tmp_path)
+    path = desk.place_for("../list.mp4", (".mp4",))
+    path.write_text("ffconcat version 1.0\nfile /etc/passwd\n")
+    with pytest.raises(DataError, match=r"^\.\./list\.mp4: cannot be opened as a video, expected AVI"):
+        desk.drop([("../list.mp4", path)])
 
 
 def test_old_files_and_downloads_go(tmp_path):
