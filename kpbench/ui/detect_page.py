@@ -18,7 +18,7 @@ from kpbench.patches.design import shipped_patches
 from kpbench.ui.desk import OWN_DETECTOR, VIEW_CAMERA, Desk
 from kpbench.ui.guards import MOST_UPLOAD_BYTES
 from kpbench.ui.parts import in_worker
-from kpbench.ui.watcher import MOST_PHOTOS, Sight, describe_pose, point_rows, pose_numbers
+from kpbench.ui.watcher import MOST_PICTURES, SeenImage, describe_pose, point_rows, pose_numbers
 
 PICTURE_PERIOD_S, TABLE_PERIOD_S = 0.04, 0.5
 """Times between two updates of the picture, and of the table and the plot."""
@@ -28,7 +28,7 @@ SEEN_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
 SETTING_SUFFIXES = (*CALIBRATION_SUFFIXES, ".toml")
 AXES = ("x", "y", "z")
 AXIS_COLOURS = ("#d55e00", "#009e73", "#56b4e9")
-COLUMNS = {"design": "design", "x": "x px", "y": "y px", "radii": "radii px", "score": "score"}
+POINT_COLUMNS = {"design": "design", "x": "x px", "y": "y px", "radii": "radii px", "score": "score"}
 
 
 class DetectPage:
@@ -44,7 +44,7 @@ class DetectPage:
             with ui.element("section").classes("kp-card"):
                 ui.html("<h2>Points</h2>", sanitize=False)
                 columns = [
-                    {"name": key, "label": label, "field": key, "align": "left"} for key, label in COLUMNS.items()
+                    {"name": key, "label": label, "field": key, "align": "left"} for key, label in POINT_COLUMNS.items()
                 ]
                 self.table = ui.table(rows=[], columns=columns, row_key="n").classes("kp-full").props("dense flat")
             with ui.element("section").classes("kp-card") as self.plot_card:
@@ -111,13 +111,13 @@ class DetectPage:
         """Look at what the browser sent."""
         self.upload.reset()
         with _Shown(self):
-            files = event.files[:MOST_PHOTOS]
+            files = event.files[:MOST_PICTURES]
             places = [(file.name, self.desk.place_for(file.name, SEEN_SUFFIXES)) for file in files]
             for file, (_, path) in zip(files, places, strict=True):
                 await file.save(path)
             await in_worker(self.desk.drop, places)
-            if len(event.files) > MOST_PHOTOS:
-                self.problem.text = f"{len(event.files)} files, of which the first {MOST_PHOTOS} are shown"
+            if len(event.files) > MOST_PICTURES:
+                self.problem.text = f"{len(event.files)} files, of which the first {MOST_PICTURES} are shown"
         self.chosen = -1
 
     async def take_settings(self, event: MultiUploadEventArguments) -> None:
@@ -199,7 +199,7 @@ class DetectPage:
         self.freeze.text, self.freeze.icon = ("Go on", "play_arrow") if watcher.is_frozen else ("Freeze", "pause")
         self.status.text = self.describe(sight)
 
-    def show_figures(self, sight: Sight | None) -> None:
+    def show_figures(self, sight: SeenImage | None) -> None:
         """Show the table, the pose, the plot and the names of the photographs."""
         kept = list(self.desk.watcher.kept)
         own = self.desk.design
@@ -214,10 +214,10 @@ class DetectPage:
         self.photos.visible = not is_film and len(kept) > 1
         if self.photos.visible and sight is not None:
             self.photos.set_options(
-                {other.number: other.record.file for other in kept[-MOST_PHOTOS:]}, value=sight.number
+                {other.number: other.record.file for other in kept[-MOST_PICTURES:]}, value=sight.number
             )
 
-    def describe(self, sight: Sight | None) -> str:
+    def describe(self, sight: SeenImage | None) -> str:
         """Return what is going on, in a line."""
         watcher = self.desk.watcher
         if sight is None:
@@ -263,7 +263,7 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
     return upload
 
 
-def _plot(sights: list[Sight]) -> dict[str, Any]:
+def _plot(sights: list[SeenImage]) -> dict[str, Any]:
     """Return the plot of the poses, for ECharts: place above, rotation below."""
     poses = [pose_numbers(sight.record) for sight in sights]
     times = [_time_of(sight) for sight in sights]
@@ -312,6 +312,6 @@ def _plot(sights: list[Sight]) -> dict[str, Any]:
     }
 
 
-def _time_of(sight: Sight) -> float:
+def _time_of(sight: SeenImage) -> float:
     """Return the time of a frame, s, or its number if the film has no times."""
     return sight.number if sight.record.time_s is None else round(sight.record.time_s, 3)

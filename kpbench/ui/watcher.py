@@ -35,7 +35,7 @@ from kpbench.types import Detections, Predictions, UInt8
 
 MOST_KEPT = 3000
 """Number of the newest images whose detections and poses are kept, for the plot and the files."""
-MOST_PHOTOS = 50
+MOST_PICTURES = 50
 """Largest number of photographs whose pictures are kept."""
 LARGEST_SHOWN_PX = 1920
 """Longest side of a shown picture, px. Larger images are shown smaller."""
@@ -92,7 +92,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Sight:
+class SeenImage:
     """One image, and what was found in it.
 
     Attributes
@@ -123,7 +123,7 @@ class Watcher:
 
     Attributes
     ----------
-    kept : deque of Sight
+    kept : deque of SeenImage
         The newest sights.
     problems : list of str
         One line for each thing that went wrong with the present source.
@@ -145,7 +145,7 @@ class Watcher:
     (['mine.png'], ['gone.png: no such dataset, image, folder or video'])
     """
 
-    kept: deque[Sight] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
+    kept: deque[SeenImage] = field(default_factory=lambda: deque(maxlen=MOST_KEPT))
     problems: list[str] = field(default_factory=list)
     is_film: bool = False
     is_frozen: bool = False
@@ -185,7 +185,7 @@ class Watcher:
             self._thread.join(timeout_s)
 
     @property
-    def newest(self) -> Sight | None:
+    def newest(self) -> SeenImage | None:
         """The newest sight."""
         return self.kept[-1] if self.kept else None
 
@@ -195,7 +195,7 @@ class Watcher:
         times_s = list(self._times_s)
         return (len(times_s) - 1) / (times_s[-1] - times_s[0]) if len(times_s) > 1 else 0.0
 
-    def sight(self, number: int) -> Sight | None:
+    def sight(self, number: int) -> SeenImage | None:
         """Return a sight with its picture: that of a number, or the newest one if it is gone."""
         found = next((sight for sight in list(self.kept) if sight.number == number and sight.picture), None)
         return found or self.newest
@@ -232,6 +232,7 @@ class Watcher:
         """Look at all sources, in the thread."""
         try:
             self.detector = load_detector(look.detector, None, look.patches or None)
+            self.detector(np.full((64, 64), 128, np.uint8))  # loads its weights, which is no time of the first image
             for shown, source in sources:
                 try:
                     self._look_at(open_images(source), shown, look, stop)
@@ -283,9 +284,9 @@ class Watcher:
             pass
         return time.monotonic() - start_s
 
-    def _keep(self, sight: Sight) -> None:
+    def _keep(self, sight: SeenImage) -> None:
         """Keep a sight, and drop the picture that is too old."""
-        behind = 1 if self.is_film else MOST_PHOTOS
+        behind = 1 if self.is_film else MOST_PICTURES
         if len(self.kept) >= behind:
             self.kept[-behind] = replace(self.kept[-behind], picture=b"")
         self.kept.append(sight)
@@ -297,7 +298,7 @@ Place = tuple[int, str, int | None, float | None]
 """Number, file, frame and time of an image."""
 
 
-def _track(image: UInt8, place: Place, tracker: Tracker) -> Sight:
+def _track(image: UInt8, place: Place, tracker: Tracker) -> SeenImage:
     """Follow the board in a frame."""
     start_s = time.perf_counter()
     found = tracker(image, place[3])
@@ -306,10 +307,10 @@ def _track(image: UInt8, place: Place, tracker: Tracker) -> Sight:
     record = PoseRecord(*place, tracker.board.name, found.pose, found.reason, found.state, found.filtered)
     drawn = draw_detections(image, detections)
     drawn = draw_pose(drawn, found, tracker) if found.state else drawn
-    return Sight(place[0], detections, record, (image.shape[1], image.shape[0]), ms, _shown(drawn))
+    return SeenImage(place[0], detections, record, (image.shape[1], image.shape[0]), ms, _shown(drawn))
 
 
-def _detect(image: UInt8, place: Place, detector: LoadedDetector, look: Look, tracker: Tracker | None) -> Sight:
+def _detect(image: UInt8, place: Place, detector: LoadedDetector, look: Look, tracker: Tracker | None) -> SeenImage:
     """Look for patches in an image, and for the board among them. ``tracker`` only draws the pose."""
     size_px, start_s = (image.shape[1], image.shape[0]), time.perf_counter()
     detections = detector(image)
@@ -322,7 +323,7 @@ def _detect(image: UInt8, place: Place, detector: LoadedDetector, look: Look, tr
     drawn = draw_detections(image, detections)
     if record.pose is not None and tracker is not None:
         drawn = draw_pose(drawn, TrackedPose("seen", record.pose), tracker)
-    return Sight(place[0], detections, record, size_px, ms, _shown(drawn))
+    return SeenImage(place[0], detections, record, size_px, ms, _shown(drawn))
 
 
 def _shown(drawn: UInt8) -> bytes:
@@ -341,7 +342,7 @@ def _written(name: str, write: Callable[[Path], None]) -> bytes:
         return path.read_bytes()
 
 
-def point_rows(sight: Sight, names: Mapping[int, str]) -> list[dict[str, Any]]:
+def point_rows(sight: SeenImage, names: Mapping[int, str]) -> list[dict[str, Any]]:
     """Return the detections of an image as rows of a table, the best first. ``names`` are those of the designs."""
     found, rows = sight.detections, list[dict[str, Any]]()
     for n in np.argsort(-found.score, kind="stable").tolist():
@@ -381,5 +382,5 @@ def describe_pose(record: PoseRecord) -> str:
     return (
         f"{record.board}, {record.state}: x {place[0]:.1f}, y {place[1]:.1f}, z {place[2]:.1f} mm; turned by "
         f"{turn[0]:.1f}, {turn[1]:.1f}, {turn[2]:.1f}° about x, y, z; {pose.points} points, "
-        f"{pose.reprojection_rms_px:.2f} px rms{unsure}"
+        f"{pose.reprojection_rms_px:.3f} px rms{unsure}"
     )

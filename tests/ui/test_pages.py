@@ -64,6 +64,7 @@ def scene(tmp_path_factory):
     )
     images = [track_scenes.shot(track_scenes.pose_at(n, turn_deg=1), board) for n in range(6)]
     cv2.imwrite(str(folder / "photo.png"), images[5])
+    cv2.imwrite(str(folder / "other.png"), images[0])
     video = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 10.0, size, False)
     for image in images:
         video.write(image)
@@ -176,15 +177,18 @@ def test_a_photograph_and_a_film_are_looked_at(address, open_page, scene, here):
     page.wait_for_selector("[data-kp=pose]:has-text('no board is chosen')")
     drop(page, [scene / "hexagon-trefoil.json", scene / "camera.yaml"], place=1)
     page.wait_for_selector("[data-kp=pose]:has-text('hexagon-trefoil')")
-    drop(page, scene / "photo.png")
-    status(page, "6 points")
+    drop(page, [scene / "photo.png", scene / "other.png"])
+    choose(page, "Photograph", "other.png")
+    status(page, "other.png, 406 x 310 px: 6 points")
+    choose(page, "Photograph", "photo.png")
+    status(page, "photo.png, 406 x 310 px: 6 points")
     page.wait_for_selector("[data-kp=pose]:has-text('hexagon-trefoil, seen: x ')")
     assert page.locator("tbody tr").count() == 6
     for name in ("predictions", "picture", "poses"):
         with page.expect_download() as done:
             page.get_by_role("button", name=f"Save {name}").click()
         done.value.save_as(done.value.suggested_filename)
-    assert len(read_predictions("predictions.json").xy) == 6
+    assert len(read_predictions("predictions.json").xy) == 12
     assert cv2.imread("photo-overlay.jpg").shape == (310, 406, 3)
     assert "hexagon-trefoil" in Path("poses.csv").read_text()
     drop(page, scene / "film.mp4")

@@ -12,7 +12,7 @@ from kpbench.geometry import write_camera
 from kpbench.predictions import read_predictions
 from kpbench.ui.designer import PrintChoice, print_files
 from kpbench.ui.desk import FILE_BOARD, FILE_CAMERA, MY_BOARD, VIEW_CAMERA, Desk
-from kpbench.ui.watcher import MOST_PHOTOS, Look, Watcher, describe_pose, point_rows, pose_numbers
+from kpbench.ui.watcher import MOST_PICTURES, Look, Watcher, describe_pose, point_rows, pose_numbers
 
 pytestmark = pytest.mark.usefixtures("here")
 LOOK = Look(board=track_scenes.BOARD, camera=track_scenes.CAMERA)
@@ -102,8 +102,8 @@ def test_a_film_is_frozen_and_ended():
 
 def test_few_pictures_of_photographs_are_kept():
     cv2.imwrite("c.png", np.full((48, 64), 128, np.uint8))
-    watcher = watch([("c.png", "c.png")] * (MOST_PHOTOS + 2), Look("orb"))
-    assert [bool(sight.picture) for sight in watcher.kept] == [False] * 2 + [True] * MOST_PHOTOS
+    watcher = watch([("c.png", "c.png")] * (MOST_PICTURES + 2), Look("orb"))
+    assert [bool(sight.picture) for sight in watcher.kept] == [False] * 2 + [True] * MOST_PICTURES
 
 
 def test_a_desk_takes_files_by_what_they_hold(tmp_path):
