@@ -30,8 +30,8 @@ def run_application(
     @app.get("/picture/{number}")
     def send_picture(number: int) -> Response:
         sight = desk.watcher.sight(number)
-        if sight is None:
-            return GONE
+        if sight is None:  # another source was opened meanwhile
+            return Response(status_code=204)
         return Response(sight.picture, media_type="image/jpeg", headers={"cache-control": "no-store"})
 
     @app.get("/download/{key}")

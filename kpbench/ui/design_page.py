@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from nicegui import background_tasks, ui
+from nicegui import ui
 
 from kpbench.errors import KpbenchError
 from kpbench.images import encode_png
@@ -21,6 +21,7 @@ from kpbench.ui.designer import (
     PREVIEW_VIEWS,
     SHEET_FORMATS,
     SHEETS,
+    PrintChoice,
     QuickMeasures,
     add_semicircle,
     chosen_boards,
@@ -35,10 +36,12 @@ from kpbench.ui.designer import (
     print_files,
 )
 from kpbench.ui.desk import Desk
-from kpbench.ui.parts import QuickSlider, figures_table, in_worker
+from kpbench.ui.parts import Newest, QuickSlider, figures_table, in_worker
 
 DRAWING_RADIUS_PX = 120.0
 """Radius of the disc in the large drawing, px."""
+MOST_MEASURED = 8
+"""Largest number of semi-circles of a design that is measured: the time grows with its square."""
 DESIGN_CHOICES = {"this": "this design", "shipped": "the shipped four", "mixed": "the four, this one by its ID"}
 SHEET_NAMES = dict(
     zip(SHEETS, ("patches to cut out", "hexagon board", "grid board", "truth board", "field"), strict=True)
@@ -57,8 +60,7 @@ class DesignPage:
     """The page. It shows the design and the print of a desk, and changes them."""
 
     def __init__(self, desk: Desk) -> None:
-        self.desk, self.measured, self.printed = desk, object(), object()
-        self.is_busy = False
+        self.desk = desk
         with ui.element("section").classes("kp-card"):
             ui.html("<h2>Design</h2>", sanitize=False)
             shipped = {patch.patch_id: patch.name for patch in shipped_patches()}
@@ -80,6 +82,8 @@ class DesignPage:
                 ui.html("<h2>How exact, how distinct</h2>", sanitize=False)
                 self.measures = ui.html("", sanitize=False).props('data-kp="measures" aria-live="polite"')
             self._make_print()
+        self.printer = Newest(lambda: (desk.design, desk.choice), self.show_sheet, self.sheet)
+        self.measurer = Newest(lambda: desk.design, self.show_measures, self.measures)
         self.show_controls()
         self.refresh()
 
@@ -171,31 +175,19 @@ class DesignPage:
             )
             rows.append(f'<tr><th scope="row">{radius_px:g} px</th>{"".join(cells)}</tr>')
         self.previews.content = f'<table class="previews"><tr><td></td>{head}</tr>{"".join(rows)}</table>'
-        if not self.is_busy:
-            background_tasks.create(self.work())
-
-    async def work(self) -> None:
-        """Print and measure the newest design, until nothing newer is there."""
-        self.is_busy = True
-        try:
-            while (wanted := (self.desk.design, self.desk.choice)) != self.printed or wanted[0] != self.measured:
-                if wanted != self.printed:
-                    await self.show_sheet(*wanted)
-                    self.printed = wanted
-                elif wanted[0] != self.measured:
-                    await self.show_measures(wanted[0])
-                    self.measured = wanted[0]
-        finally:
-            self.is_busy = False
+        self.printer.start()
+        self.measurer.start()
 
     async def show_measures(self, design: Patch) -> None:
         """Show bounds and biases, and then distances, unless the design has changed meanwhile."""
-        quick = await in_worker(measure_quickly, design)
+        if len(design.semicircles) > MOST_MEASURED:
+            self.measures.content = f"Designs of more than {MOST_MEASURED} semi-circles are not measured here."
+            return
+        quick = await in_worker(measure_quickly, design, is_measure=True)
         self.measures.content = _measure_tables(design, quick, None)
         if self.desk.design == design:
-            self.measures.content = _measure_tables(
-                design, quick, await in_worker(distances_to, design, other_designs(design))
-            )
+            distances = await in_worker(distances_to, design, other_designs(design), is_measure=True)
+            self.measures.content = _measure_tables(design, quick, distances)
 
     def _make_print(self) -> None:
         """Make the card of the print."""
@@ -244,12 +236,12 @@ class DesignPage:
             return
         change: dict[str, Any] = {key: int(value) if whole else value}
         self.desk.choice = replace(self.desk.choice, **change)
-        if not self.is_busy:
-            background_tasks.create(self.work())
+        self.printer.start()
 
-    async def show_sheet(self, design: Patch, choice: Any) -> None:
+    async def show_sheet(self, wanted: tuple[Patch, PrintChoice]) -> None:
         """Show the first page, or why it cannot be printed."""
         try:
+            design, choice = wanted
             files = await in_worker(print_files, design, choice, ["svg"])
             problems = [problem for board in chosen_boards(design, choice) if (problem := pose_problem(board))]
         except KpbenchError as error:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Generic, TypeVar
 
-from nicegui import ui
+from nicegui import background_tasks, ui
 from nicegui.events import GenericEventArguments
 
 from kpbench.text import escape_markup
@@ -18,12 +18,48 @@ from kpbench.ui.desk import Desk
 Result = TypeVar("Result")
 TITLES = {"/": "Design and print", "/detect": "Detect and live"}
 """Title of each page, by address."""
-_worker = ThreadPoolExecutor(1, "kpbench-ui")
+_actions, _measures = ThreadPoolExecutor(1, "kpbench-actions"), ThreadPoolExecutor(1, "kpbench-measures")
 
 
-async def in_worker(function: Callable[..., Result], *arguments: object) -> Result:
-    """Call a function in a thread, one at a time. The event loop answers requests meanwhile."""
-    return await asyncio.get_running_loop().run_in_executor(_worker, lambda: function(*arguments))
+async def in_worker(function: Callable[..., Result], *arguments: object, is_measure: bool = False) -> Result:
+    """Call a function in a thread; actions and measures one at a time each. The event loop goes on meanwhile."""
+    pool = _measures if is_measure else _actions
+    return await asyncio.get_running_loop().run_in_executor(pool, lambda: function(*arguments))
+
+
+class Newest(Generic[Result]):
+    """Calls a slow function with the newest value; what was wished while it ran is skipped, but for the last.
+
+    Parameters
+    ----------
+    wish : callable
+        Returns the value that is wished now.
+    function : callable
+        Coroutine function of the value.
+    owner : Element
+        Nothing is called once this element is gone.
+    """
+
+    def __init__(
+        self, wish: Callable[[], Result], function: Callable[[Result], Coroutine[Any, Any, None]], owner: ui.element
+    ) -> None:
+        self.wish, self.function, self.owner = wish, function, owner
+        self.done: object = None
+        self.is_busy = False
+
+    def start(self) -> None:
+        """Call the function, unless it runs already, and will come to this wish by itself."""
+        if not self.is_busy:
+            self.is_busy = True
+            background_tasks.create(self._run())
+
+    async def _run(self) -> None:
+        try:
+            while not self.owner.is_deleted and (wanted := self.wish()) != self.done:
+                self.done = wanted
+                await self.function(wanted)
+        finally:
+            self.is_busy = False
 
 
 class QuickSlider(ui.slider):

@@ -71,11 +71,11 @@ def serve(
         before, tempfile.tempdir = tempfile.tempdir, folder  # of parts of uploads
         os.environ["NICEGUI_STORAGE_PATH"] = folder
         try:
-            from kpbench.ui.application import run_application
-
+            try:
+                from kpbench.ui.application import run_application
+            except ModuleNotFoundError as error:
+                raise DataError(f"the application needs NiceGUI: pip install 'kpbench[ui]' ({error})") from None
             run_application(desk, host, port, open_browser, "/" if source is None else "/detect", started)
-        except ModuleNotFoundError as error:
-            raise DataError(f"the application needs NiceGUI: pip install 'kpbench[ui]' ({error})") from None
         finally:
             tempfile.tempdir = before
             desk.watcher.close()

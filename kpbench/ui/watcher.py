@@ -178,6 +178,7 @@ class Watcher:
         """End the present source."""
         self._stop.set()
         self.wait(5.0)
+        self.is_running = False
 
     def wait(self, timeout_s: float | None = None) -> None:
         """Wait until the present source has ended."""

@@ -60,6 +60,8 @@ def test_measures_are_those_of_the_analysis():
     assert distances_to(TREFOIL, [CHECKER]) == {"checker": pytest.approx(0.215, abs=1e-3)}
     assert TREFOIL not in other_designs(TREFOIL)
     assert distances_to(TREFOIL, []) == {}
+    assert set(measure_quickly(edit_design(TREFOIL, semicircles=())).bias_px["sRGB"]) == {float("inf")}
+    assert max(measure_quickly(OWN).bias_px["sRGB"]) < 1
 
 
 CHOICES = {
