@@ -19,6 +19,9 @@ from kpbench.ui.parts import page_frame
 
 GONE = Response("kpbench: it is gone; reload the page\n", 404, media_type="text/plain")
 
+RECONNECT_S = 30.0
+"""Time for which a browser may be silent, s: a machine that detects may be slow to answer."""
+
 
 def run_application(
     desk: Desk, host: str, port: int, open_browser: bool, first_page: str, started: Callable[[str], None]
@@ -72,5 +75,6 @@ def run_application(
         tailwind=False,
         show_welcome_message=False,
         message_history_length=100,
+        reconnect_timeout=RECONNECT_S,
         uvicorn_logging_level="error",
     )
