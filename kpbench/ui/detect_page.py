@@ -35,7 +35,7 @@ class DetectPage:
     """The page. It shows what the watcher of a desk sees."""
 
     def __init__(self, desk: Desk) -> None:
-        self.desk, self.chosen, self.shown, self.drawn_s = desk, -1, (-1, -1), 0.0
+        self.desk, self.chosen, self.shown, self.figured, self.drawn_s = desk, -1, -1, (-1, -1), 0.0
         with ui.element("div").classes("kp-stack"):
             self._make_source()
             self._make_look()
@@ -184,17 +184,15 @@ class DetectPage:
         watcher = self.desk.watcher
         sight = watcher.sight(self.chosen)
         number = -1 if sight is None else sight.number
-        if number != self.shown[0]:
+        if number != self.shown:
+            self.shown = number
             self.image.set_source("" if sight is None else f"/picture/{number}")
             self.empty.visible = sight is None
         self.trouble.text = "; ".join(watcher.problems[:3])
-        is_due = time.monotonic() - self.drawn_s > TABLE_PERIOD_S
-        if is_due and (number, len(watcher.kept)) != self.shown:
-            self.drawn_s = time.monotonic()
-            self.shown = (number, len(watcher.kept))
+        newest = (number, len(watcher.kept))
+        if newest != self.figured and time.monotonic() - self.drawn_s > TABLE_PERIOD_S:
+            self.figured, self.drawn_s = newest, time.monotonic()
             self.show_figures(sight)
-        else:
-            self.shown = (number, self.shown[1])
         self.freeze.visible = watcher.is_film and watcher.is_running
         self.freeze.text, self.freeze.icon = ("Go on", "play_arrow") if watcher.is_frozen else ("Freeze", "pause")
         self.status.text = self.describe(sight)
