@@ -59,7 +59,7 @@ class DetectPage:
     def _make_source(self) -> None:
         with ui.element("section").classes("kp-card"):
             ui.html("<h2>Source</h2>", sanitize=False)
-            self.upload = _make_upload("Drop photographs or a film here", SEEN_SUFFIXES, self.take_images, self.refuse)
+            _make_upload("Drop photographs or a film here", SEEN_SUFFIXES, self.take_images, self.refuse)
             with ui.element("div").classes("kp-row"):
                 camera = ui.number("Camera", value=0, min=0, max=99, precision=0).style("width: 90px")
                 ui.button("Open the camera", on_click=lambda: self.open_camera(camera.value)).props("outline")
@@ -83,7 +83,7 @@ class DetectPage:
                 self.view.on_value_change(lambda e: self.look(view_deg=e.value))
                 self.view.bind_visibility_from(self.camera, "value", value=VIEW_CAMERA)
             text = "A board's file (.json, .toml), or a calibration"
-            self.settings = _make_upload(text, SETTING_SUFFIXES, self.take_settings, self.refuse)
+            _make_upload(text, SETTING_SUFFIXES, self.take_settings, self.refuse)
             ui.label("A pose needs a board and a camera.").classes("kp-note")
 
     def _make_picture(self) -> None:
@@ -109,7 +109,6 @@ class DetectPage:
 
     async def take_images(self, event: MultiUploadEventArguments) -> None:
         """Look at what the browser sent."""
-        self.upload.reset()
         with _Shown(self):
             files = event.files[:MOST_PICTURES]
             places = [(file.name, self.desk.place_for(file.name, SEEN_SUFFIXES)) for file in files]
@@ -122,7 +121,6 @@ class DetectPage:
 
     async def take_settings(self, event: MultiUploadEventArguments) -> None:
         """Take a board or a camera."""
-        self.settings.reset()
         with _Shown(self):
             for file in event.files:
                 path = self.desk.place_for(file.name, SETTING_SUFFIXES)
@@ -243,7 +241,7 @@ class _Shown:
         return False
 
 
-def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -> ui.upload:
+def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -> None:
     """Make a place to drop files, and a button that the keyboard reaches."""
     upload = ui.upload(
         multiple=True,
@@ -255,10 +253,11 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
         on_rejected=refuse,
     )
     upload.classes("kp-full").props(f'flat bordered accept="{",".join(suffixes)}"')
+    for event in ("uploaded", "failed"):  # once the browser has the answer; earlier, it would abort the upload
+        upload.on(event, js_handler=f"() => runMethod({upload.id}, 'reset', [])")
     upload.on("failed", refuse, args=[])
     button = ui.button("Choose files", icon="folder_open").props("outline").props(f'aria-label="choose files: {text}"')
     button.on("click", js_handler=f"() => runMethod({upload.id}, 'pickFiles', [])")
-    return upload
 
 
 def _plot(sights: list[SeenImage]) -> dict[str, Any]:

@@ -180,6 +180,7 @@ def test_a_photograph_and_a_film_are_looked_at(address, open_page, scene, here):
     drop(page, [scene / "photo.png", scene / "other.png"])
     choose(page, "Photograph", "other.png")
     status(page, "other.png, 406 x 310 px: 6 points")
+    playwright.expect(page.get_by_text("refused:")).to_have_count(0)
     choose(page, "Photograph", "photo.png")
     status(page, "photo.png, 406 x 310 px: 6 points")
     page.wait_for_selector("[data-kp=pose]:has-text('hexagon-trefoil, seen: x ')")
