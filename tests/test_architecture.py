@@ -82,6 +82,19 @@ ROOMS = {
         "dataset",
         "synth",
     ],
+    "ui": [
+        "geometry",
+        "patches",
+        "boards",
+        "printing",
+        "render",
+        "degrade",
+        "predictions",
+        "dataset",
+        "analysis",
+        "detectors",
+        "tracking",
+    ],
     "evaluate": ["dataset", "predictions", "scoring", "report", "synth"],
     "benchmark": ["patches", "dataset", "synth", "predictions", "scoring", "report", "detectors"],
 }
@@ -90,8 +103,9 @@ LAST = "cli"
 """The room that may import every other one, and that no other may import."""
 TORCH_ROOM = "training"
 H5PY_MODULES = {"hdf5", "hdf5_structure", "dataset.shard", "predictions.h5_files"}
+NICEGUI_ROOM = "ui"
 ONNXRUNTIME_ROOMS = {"detectors", TORCH_ROOM}
-HEAVY = {"torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
+HEAVY = {"nicegui", "torch", "h5py", "onnxruntime", "cv2", "pandas", "scipy"}
 """Packages that neither ``import kpbench`` nor ``kpbench --help`` loads."""
 LARGEST_FILE, LARGEST_FUNCTION = 400, 60
 """Lines; those of a function without its docstring."""
@@ -196,6 +210,7 @@ def test_a_room_imports_what_its_row_names(path):
     else:
         assert room in ("kpbench", LAST), f"{room} has no row in the table"
     assert "torch" not in outside or room == TORCH_ROOM
+    assert not outside & {"nicegui", "fastapi"} or room == NICEGUI_ROOM
     assert "h5py" not in outside or name_of(path) in H5PY_MODULES
     assert "onnxruntime" not in outside or room in ONNXRUNTIME_ROOMS
 

@@ -74,6 +74,8 @@ export-model small.onnx --int8 --out small-int8.onnx
 train --verifier ellipse set --test set --epochs 0 --workers 1 --out ellipse
 train --verifier judges set --test set --epochs 0 --workers 1 --out judges
 analyze-patches --json measures.json --figure measures.svg
+ui --help
+live --help
 demo --n 2
 """
 """Each line is a command line; a command may read what the commands before it wrote."""

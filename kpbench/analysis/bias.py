@@ -70,7 +70,7 @@ def camera_bias(
     >>> round(camera_bias(checker)["sRGB"], 2), round(camera_bias(wheel)["sRGB"], 2)
     (0.0, 0.13)
     """
-    half = int(np.ceil(radius_px * 1.1 + 4 * blur_px)) + 2
+    half = int(np.ceil(radius_px * max(1.1, patch.extent + 0.05) + 4 * blur_px)) + 2
     axis = np.arange(-half, half + 1)
     inside = np.hypot(axis[:, None], axis) < radius_px - 2 * blur_px - 1
     if inside.sum() < 30:
@@ -95,7 +95,7 @@ def camera_bias(
     if knows_tone:
         columns += [ink * (1 - ink), ink * (1 - ink) * (1 - 2 * ink)]
     J = np.column_stack([column[inside] for column in columns])
-    lengths = np.linalg.norm(J, axis=0)
+    lengths = np.maximum(np.linalg.norm(J, axis=0), 1e-12)  # a disc of one ink has derivatives of 0
     J = J / lengths
 
     def bias(seen: Float) -> float:

@@ -43,6 +43,8 @@ COMMANDS = {
     "leaderboard": ("leaderboard:leaderboard", "Verify the scores of a submission by running its detectors again."),
     "train": ("train:train", "Train the detector, or its verifier; needs kpbench[train]."),
     "export-model": ("train:export_model", "Write trained weights as an ONNX file."),
+    "ui": ("ui:ui", "Design, print and look, in a browser; needs kpbench[ui]."),
+    "live": ("ui:live", "Watch a camera or a film in a browser; needs kpbench[ui]."),
     "demo": ("demo:demo", "Run the whole chain with few images, in about a minute."),
 }
 

@@ -1,0 +1,3 @@
+from .serving import serve as serve
+
+__all__: list[str]
