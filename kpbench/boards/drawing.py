@@ -47,7 +47,7 @@ def draw_board(
     >>> pose = BoardPose(np.eye(3), np.array([0.0, 0.0, 350.0]), np.eye(6), 0.1, 6)
     >>> canvas = np.zeros((480, 640, 3), np.uint8)
     >>> draw_board(canvas, board, pose, Camera(640, 480, 700.0))
-    >>> canvas.any()
+    >>> bool(canvas.any())
     True
     """
     camera = camera.at_size(canvas.shape[1], canvas.shape[0])

@@ -23,14 +23,16 @@ def print_found(predictions: Predictions, records: Sequence[PoseRecord], patches
     names = {patch.patch_id: patch.name for patch in patches}
     p, file = predictions, predictions.file[0] if predictions.file is not None else "image"
     echo(f"{file}: {len(p.xy)} detections by {p.detector['name']}")
+    point = "" if p.points is None else "  point of the board"
     if len(p.xy):
-        echo(f"{'ID':>3}  {'name':<12} {'x px':>9} {'y px':>9} {'radius px':>10} {'score':>6}")
+        echo(f"{'ID':>3}  {'name':<12} {'x px':>9} {'y px':>9} {'radius px':>10} {'score':>6}{point}")
     for n in range(min(len(p.xy), MOST_ROWS)):
         patch_id = None if p.patch_id is None else int(p.patch_id[n])
         label, name = ("-", "-") if patch_id is None else (str(patch_id), names.get(patch_id, "-"))
         radius = "-" if p.A_patch2image is None else f"{np.linalg.norm(p.A_patch2image[n], 2):.1f}"
         x, y = p.xy[n]
-        echo(f"{label:>3}  {name:<12} {x:>9.2f} {y:>9.2f} {radius:>10} {p.score[n]:>6.2f}")
+        place = "" if p.points is None else f"  {p.points[n] if p.points[n] >= 0 else '-'}"
+        echo(f"{label:>3}  {name:<12} {x:>9.2f} {y:>9.2f} {radius:>10} {p.score[n]:>6.2f}{place}")
     if len(p.xy) > MOST_ROWS:
         echo(f"… and {len(p.xy) - MOST_ROWS} more; --out FILE writes all")
     for record in records:

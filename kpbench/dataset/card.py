@@ -216,7 +216,7 @@ def draw_rungs(dataset: Dataset | CocoDataset, tile_width_px: int) -> UInt8:
     >>> config = kpbench.SuiteConfig(kpbench.load_suite("paper-v1"), images=1, size_px=(203, 155), only=("blur",))
     >>> suite = kpbench.generate(config, "blurred", workers=1).dataset
     >>> draw_rungs(suite, tile_width_px=100).shape  # four rungs
-    (100, 420, 3)
+    (102, 420, 3)
     """
     truth, tiles, titles = dataset.truth, list[UInt8](), list[str]()
     conditions = list(dict.fromkeys(truth.condition.tolist()))

@@ -206,7 +206,7 @@ def _draw_ellipse(canvas: UInt8, mark: _Mark, unit: int) -> None:
     """Draw an ellipse around a patch, and within a large patch a cross that leaves its centre free."""
     U, (major, minor), _ = np.linalg.svd(mark.A)
     width = round(float(np.clip(minor / 10, 1, 1.5 * unit)))
-    away = 2 + width / 2  # the dark outline begins just outside of the patch
+    away = 3 + width / 2  # the dark outline begins just outside of the patch
     size = _sixteenths(min(major + away, OUTERMOST_PX), min(minor + away, OUTERMOST_PX))
     angle_deg = float(np.degrees(np.arctan2(U[1, 0], U[0, 0])))
     centre = _sixteenths(mark.x, mark.y)
