@@ -176,7 +176,7 @@ def _compare(detections: Detections, truth: NDArray[Any]) -> tuple[list[str], li
         distance = np.hypot(*(detections.xy - (k["x"], k["y"])).T)
         explained = np.flatnonzero(distance <= TRUE_RADII * k["radius_major"])
         for n in explained:
-            texts[n] = f"{distance[n]:.2f} px"
+            texts[n] = f"off by {distance[n]:.3f} px"
         if not len(explained):
             missed.append(k)
     return texts, missed
