@@ -57,9 +57,9 @@ def move_links(text: str, path: Path, name: str, places: dict[Path, str]) -> str
 
     def move(link: re.Match[str]) -> str:
         head, target, tail = link.groups()
-        if ":" in target:
-            return link[0]
         file = (path.parent / target).resolve()
+        if ":" in target or not file.exists():  # a picture of a notebook, or a dead link
+            return link[0]
         if file in places:
             moved = os.path.relpath(places[file], Path(name).parent)
             return f"{head}{moved.removesuffix('.ipynb') + '.md' if file.suffix == '.ipynb' else moved}{tail}"
@@ -134,7 +134,9 @@ def build(folder: Path) -> list[str]:
     shutil.copy(DOCS / "zensical.toml", folder)
     command = [sys.executable, "-m", "zensical", "build", "--strict", "--clean"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    said = [line for line in (done.stdout + done.stderr).splitlines() if re.search("warning|error", line, re.IGNORECASE)]
+    said = [
+        line for line in (done.stdout + done.stderr).splitlines() if re.search("warning|error", line, re.IGNORECASE)
+    ]
     if done.returncode:
         return [*said, f"zensical ended with {done.returncode}"]
     return said + broken_links(folder / "site")
