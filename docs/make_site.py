@@ -47,7 +47,9 @@ def write_sources(folder: Path) -> None:
             target.write_text(move_links(path.read_text(), path, name, places))
         elif path.suffix == ".ipynb":
             text = notebook_as_markdown(json.loads(path.read_text()), target.with_suffix(""))
-            target.with_suffix(".md").write_text(move_links(text, path, name, places))
+            text = move_links(text, path, name, places) + f"\n[Download this notebook]({path.name})\n"
+            target.with_suffix(".md").write_text(text)
+            shutil.copy(path, target)
         else:
             shutil.copy(path, target)
 
@@ -71,7 +73,7 @@ def move_links(text: str, path: Path, name: str, places: dict[Path, str]) -> str
 
 def notebook_as_markdown(notebook: dict[str, Any], images: Path) -> str:
     """Return the cells of a notebook and their outputs as Markdown; pictures are written beside it."""
-    parts = [f"[Download this notebook]({images.name}.ipynb)"]
+    parts = []
     for n, cell in enumerate(notebook["cells"]):
         source = "".join(cell["source"])
         parts.append(source if cell["cell_type"] == "markdown" else f"```python\n{source}\n```")
@@ -83,8 +85,7 @@ def notebook_as_markdown(notebook: dict[str, Any], images: Path) -> str:
                 parts.append(f"![Output of the cell above]({picture.name})")
             elif text := "".join(output.get("text", data.get("text/plain", []))):
                 parts.append(f"```text\n{text.rstrip()}\n```")
-    title, *rest = parts[1:]
-    return "\n\n".join([title, parts[0], *rest, ""])
+    return "\n\n".join([*parts, ""])
 
 
 class Page(HTMLParser):

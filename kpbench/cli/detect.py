@@ -228,7 +228,7 @@ class BoardFinder:
         self.records += records
         return located
 
-    def draw(self, canvas: UInt8, detections: Detections, size_px: tuple[int, int]) -> None:
+    def draw(self, detections: Detections, size_px: tuple[int, int], canvas: UInt8) -> None:
         """Draw the boards whose poses are known into the picture of an image."""
         from kpbench.boards.drawing import draw_board
         from kpbench.boards.images import find_boards

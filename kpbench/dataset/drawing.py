@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -106,6 +106,8 @@ def draw_detections(
     names: Mapping[int, str] | None = None,
     truth: NDArray[Any] | None = None,
     scale: int = 1,
+    labels: bool = True,
+    draw_below: Callable[[UInt8], None] | None = None,
 ) -> UInt8:
     """Draw the ellipse, the ID and the score of every detection on a copy of an image.
 
@@ -124,6 +126,10 @@ def draw_detections(
         The true keypoints of the image. A detection explains a keypoint within a tenth of its semi-major axis.
     scale : int
         Pixels of the result per pixel of the image, see :func:`enlarge_for_drawing`.
+    labels : bool
+        Whether to write the labels.
+    draw_below : callable, optional
+        Draws more into the picture, RGB, before the detections are drawn: such as a board.
 
     Returns
     -------
@@ -139,6 +145,8 @@ def draw_detections(
     (48, 64, 3)
     """
     canvas, marks = _enlarge(image, scale), list[_Mark]()
+    if draw_below is not None:
+        draw_below(canvas)
     errors_px, missed = ([""] * len(detections), []) if truth is None else _compare(detections, truth)
     for n, (x, y) in enumerate(detections.xy.tolist()):
         if abs(x) > OUTERMOST_PX or abs(y) > OUTERMOST_PX:
@@ -149,7 +157,8 @@ def draw_detections(
         A = detections.A_patch2image[n] if known else UNKNOWN_RADIUS_PX / scale * np.eye(2)  # type: ignore[index]
         short = "" if patch_id is None else str(patch_id)
         long = " ".join(filter(None, (_name_id(patch_id, names), f"{detections.score[n]:.2f}", errors_px[n])))
-        marks.append(_Mark(x, y, A, colour, tuple(filter(None, (long, short))), turn=known))
+        texts = tuple(filter(None, (long, short))) if labels else ()
+        marks.append(_Mark(x, y, A, colour, texts, turn=known))
     for k in missed:
         marks.append(_mark_of_keypoint(k, (f"missed {_name_id(k['patch_id'], names)}", "missed"), True))
     return _draw_marks(canvas, marks, scale)
@@ -205,7 +214,7 @@ def _draw_marks(canvas: UInt8, marks: Sequence[_Mark], scale: float) -> UInt8:
 def _draw_ellipse(canvas: UInt8, mark: _Mark, unit: int) -> None:
     """Draw an ellipse around a patch, and within a large patch a cross that leaves its centre free."""
     U, (major, minor), _ = np.linalg.svd(mark.A)
-    width = round(float(np.clip(minor / 10, 1, 1.5 * unit)))
+    width = round(float(np.clip(minor / 8, 1, 1 + unit)))
     away = 3 + width / 2  # the dark outline begins just outside of the patch
     size = _sixteenths(min(major + away, OUTERMOST_PX), min(minor + away, OUTERMOST_PX))
     angle_deg = float(np.degrees(np.arctan2(U[1, 0], U[0, 0])))

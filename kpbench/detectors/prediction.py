@@ -67,8 +67,8 @@ class ImageResult(NamedTuple):
 
 Sink = Callable[[Predictions], None]
 """A function of the predictions of some images."""
-Decorate = Callable[[UInt8, Detections, tuple[int, int]], None]
-"""A function that draws more into a picture, RGB, from the detections of an image and its width and height, px."""
+Decorate = Callable[[Detections, tuple[int, int], UInt8], None]
+"""A function of the detections of an image, its width and height in px, and its picture, RGB, that it draws into."""
 
 
 def predict(
@@ -219,10 +219,8 @@ def _draw(
 ) -> UInt8:
     """Return the picture of an image for ``overlay``."""
     names = {patch.patch_id: patch.name for patch in detector.patches}
-    canvas = draw_detections(image, found, names, truth, enlarge_for_drawing(image))
-    if decorate is not None:
-        decorate(canvas, found, _size(image))
-    return canvas
+    below = None if decorate is None else partial(decorate, found, _size(image))
+    return draw_detections(image, found, names, truth, enlarge_for_drawing(image), draw_below=below)
 
 
 def _finish(

@@ -151,8 +151,10 @@ def draw_pose(image: UInt8, found: TrackedPose, tracker: Tracker) -> UInt8:
         RGB.
     """
     detections = Detections.none() if found.match is None else found.match.detections
-    canvas = draw_detections(image, detections, {k.patch_id: k.patch.name for k in tracker.board.keypoints})
     pose = found.pose or found.filtered
-    if pose is not None:
-        draw_board(canvas, tracker.board, pose, tracker.camera, STATE_COLOURS[found.state])
-    return canvas
+
+    def draw_below(canvas: UInt8) -> None:
+        if pose is not None:
+            draw_board(canvas, tracker.board, pose, tracker.camera, STATE_COLOURS[found.state])
+
+    return draw_detections(image, detections, labels=False, draw_below=draw_below)
