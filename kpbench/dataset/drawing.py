@@ -214,7 +214,7 @@ def _draw_marks(canvas: UInt8, marks: Sequence[_Mark], scale: float) -> UInt8:
 def _draw_ellipse(canvas: UInt8, mark: _Mark, unit: int) -> None:
     """Draw an ellipse around a patch, and within a large patch a cross that leaves its centre free."""
     U, (major, minor), _ = np.linalg.svd(mark.A)
-    width = round(float(np.clip(minor / 8, 1, 1 + unit)))
+    width = round(float(np.clip(minor / 8, min(unit, 2), 1 + unit)))
     away = 3 + width / 2  # the dark outline begins just outside of the patch
     size = _sixteenths(min(major + away, OUTERMOST_PX), min(minor + away, OUTERMOST_PX))
     angle_deg = float(np.degrees(np.arctan2(U[1, 0], U[0, 0])))
