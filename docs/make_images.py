@@ -75,15 +75,18 @@ def main() -> None:
         save("page", ImageOps.expand(Image.open("patches-print/hexagon-trefoil.png"), border=1, fill=160))
 
         kpbench_command("kpbench synth --n 20 --deteriorate none")
-        kpbench_command("kpbench detect kpbench-data --detector superpoint-small --overlay found")
+        kpbench_command("kpbench detect kpbench-data --overlay found")
         save("found", f"found/{README_SCENE:08d}.png")
 
         kpbench_command("kpbench suite paper-v1 --images 1 --size 640x480 --only pitch,noise --out photographs")
         kpbench_command("kpbench export photographs --format coco")
         photo = f"photographs-coco/images/{BOARD_IMAGE:08d}.png"
-        kpbench_command(f"kpbench detect {photo} --detector superpoint-small --overlay found.png")
+        kpbench_command(f"kpbench detect {photo}")
         save("photo", photo)
-        save("found-board", "found.png")
+        save("found-board", f"{BOARD_IMAGE:08d}-found.png")
+        kpbench_command("kpbench suite paper-v1 --images 1 --size 640x480 --out suite")
+        kpbench_command("kpbench preview suite --tile-width 160 --out rungs.png")
+        save("rungs", "rungs.png")
     for path in sorted(IMAGES.glob("*.png")):
         print(f"{os.path.relpath(path)}: {path.stat().st_size / 1000:.0f} kB")
 

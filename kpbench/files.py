@@ -17,6 +17,7 @@ from typing import Any, cast
 from urllib.parse import unquote
 
 from kpbench.errors import DataError, KpbenchError, UnreadableFile, system_reason
+from kpbench.text import did_you_mean
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".gif", ".ppm", ".pgm", ".jp2")
 LARGEST_FILE = 2**31
@@ -52,6 +53,7 @@ def find_shipped(kind: str, name: str, word: str) -> Path:
     if name not in shipped and Path(name).suffix != ".toml":
         raise DataError(
             f"there is no {word} {name!r}, only: {', '.join(shipped)}, or a {FILES_OF_ONES_OWN[kind]} file of your own"
+            f"{did_you_mean(name, shipped)}"
         )
     return shipped.get(name, Path(name))
 

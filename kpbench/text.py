@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Iterable
 from html import escape
 
 LONGEST_NAME = 100
@@ -24,6 +25,17 @@ def is_name(text: object) -> bool:
         and text[0] not in " .-"
         and all(c in " ._+-" or unicodedata.category(c)[0] in "LMN" for c in text)
     )
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the known name that is closest to it, or "" if none is close.
+
+    >>> did_you_mean("suprpoint", ["template", "superpoint"])
+    "; did you mean 'superpoint'?"
+    """
+    from difflib import get_close_matches  # imported here: only a message about a mistake needs it
+
+    return "".join(f"; did you mean {close!r}?" for close in get_close_matches(name, known, n=1))
 
 
 def escape_terminal(text: str, lines: bool = False) -> str:

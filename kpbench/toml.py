@@ -14,7 +14,7 @@ from typing import Any
 
 from kpbench.errors import KpbenchError
 from kpbench.files import read_text
-from kpbench.text import NAME_RULE, is_name
+from kpbench.text import NAME_RULE, did_you_mean, is_name
 
 LARGEST = sys.float_info.max
 """Largest number that is read. Python's whole numbers have no limit, but numbers with a fraction have."""
@@ -84,7 +84,8 @@ class TomlTable:
         for key in self.values:
             if key not in self.known:
                 within = f" in {self.place}" if self.place else ""
-                raise self.error(f"unknown key {key!r}{within}; known are: {names}")
+                close = did_you_mean(key, self.known)
+                raise self.error(f"unknown key {key!r}{within}; known are: {names}{close}")
 
     def __contains__(self, key: str) -> bool:
         return key in self.values

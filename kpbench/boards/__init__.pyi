@@ -1,3 +1,4 @@
+from .drawing import draw_board as draw_board
 from .images import PoseRecord as PoseRecord
 from .images import find_boards as find_boards
 from .images import locate_boards as locate_boards

@@ -59,13 +59,17 @@ def verify(dataset: Path) -> None:
 @click.command()
 @DATASET
 @click.option("--out", type=click.Path(path_type=Path), help="PNG file to write. Default: preview.png in the dataset.")
-@click.option("--count", type=click.IntRange(1, 400), default=12, show_default=True, help="Number of images.")
+@click.option(
+    "--count", type=click.IntRange(1, 400), help="Number of images. Default: 12; of a suite, one image per rung."
+)
 @click.option("--columns", type=click.IntRange(1, 20), default=4, show_default=True, help="Number of images per row.")
 @click.option(
     "--tile-width", type=click.IntRange(64, 4096), default=480, show_default=True, help="Width of an image in px."
 )
-def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_width: int) -> None:
+def preview(dataset: Path, out: Path | None, count: int | None, columns: int, tile_width: int) -> None:
     """Draw a contact sheet of evenly spaced images with their true keypoints.
+
+    Of a suite, the sheet has a row per condition and a column per rung. With --count, the images are evenly spaced.
 
     DATASET may also be COCO annotations (.json), or a folder with annotations.json.
 
@@ -73,8 +77,9 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     Examples:
       kpbench preview photos/annotations.json --out labels.png
       kpbench preview kpbench-data --count 20 --columns 5
+      kpbench preview kpbench-suite/paper-v1 --out rungs.png
     """
-    from kpbench.dataset.card import draw_overview
+    from kpbench.dataset.card import draw_overview, draw_rungs
     from kpbench.dataset.labelled import open_labelled
     from kpbench.images import encode_png
     from kpbench.writing import require_writable, write_file
@@ -82,7 +87,11 @@ def preview(dataset: Path, out: Path | None, count: int, columns: int, tile_widt
     data = open_labelled(dataset)
     target = out or (data.path.parent if data.path.suffix == ".json" else data.path) / "preview.png"
     require_writable(target, "picture")
-    write_file(target, encode_png(draw_overview(data, count, columns, tile_width), "picture"))
+    if count is None and data.truth.condition[0]:
+        sheet = draw_rungs(data, tile_width)
+    else:
+        sheet = draw_overview(data, count or 12, columns, tile_width)
+    write_file(target, encode_png(sheet, "picture"))
     echo(target)
 
 

@@ -19,7 +19,7 @@ from kpbench.cli.options import BACKGROUNDS
     help="Folder to write into.",
 )
 @click.option("--n", type=click.IntRange(1, 100_000), default=100, show_default=True, help="Number of images.")
-@click.option("--detector", default="template", show_default=True, help="Detector, as for kpbench detect.")
+@click.option("--detector", default="superpoint-small", show_default=True, help="Detector, as for kpbench detect.")
 @BACKGROUNDS
 @click.pass_context
 def demo(ctx: click.Context, out: Path, n: int, detector: str, backgrounds: Path | None) -> None:

@@ -22,12 +22,14 @@ class Limit(click.ParamType[tuple[str, float]]):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
         from kpbench.scoring.metrics import METRICS
         from kpbench.scoring.tracks import TRACK_METRICS
+        from kpbench.text import did_you_mean
 
         if isinstance(value, tuple):
             return value
         metric, _, number = str(value).partition("=")
         if metric not in (*METRICS, *TRACK_METRICS):
-            self.fail(f"there is no metric {metric!r}, only {', '.join(METRICS)}", param, ctx)
+            close = did_you_mean(metric, (*METRICS, *TRACK_METRICS))
+            self.fail(f"there is no metric {metric!r}, only {', '.join(METRICS)}{close}", param, ctx)
         try:
             limit = float(number)
         except ValueError:

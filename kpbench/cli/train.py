@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -68,7 +69,9 @@ def _needs_torch(command: str) -> Iterator[None]:
     "published weights (.pth, .safetensors). With --verifier, the only choice is: shipped. Default: random weights.",
 )
 @click.option("--resume", is_flag=True, help="Continue from the checkpoint in --out; --init is ignored.")
-@click.option("--minutes", type=click.FloatRange(min=0.0), help="Stop after this time. Continue later with --resume.")
+@click.option(
+    "--minutes", type=click.FloatRange(min=0.0), help="Stop after this time in all. Continue later with --resume."
+)
 @click.option(
     "--workers",
     type=click.IntRange(min=0),
@@ -146,30 +149,36 @@ def _train_detector(
     threads: int | None,
     tensorboard: bool,
 ) -> None:
+    began = time.monotonic()  # before PyTorch is loaded, which takes seconds
     from kpbench.patches.design import load_patches, shipped_patches
     from kpbench.training.recipe import load_recipe
 
     recipe = load_recipe(config)
+    if sys.stderr.isatty():
+        echo(f"{recipe.name}: loading PyTorch, making images for the validation", err=True)
     with _needs_torch("train"):
         from kpbench.training.loop import TrainOptions
         from kpbench.training.loop import train as train_network
         from kpbench.training.pipeline import make_weights
+
+    def left() -> float | None:
+        return None if minutes is None else minutes - (time.monotonic() - began) / 60
+
     folder = out or Path("runs") / recipe.name
     designs = load_patches(patches) if patches else shipped_patches()
-    processes, began = 1 if workers is None else workers, time.monotonic()
+    processes = 1 if workers is None else workers
     finished = train_network(
         recipe,
         folder,
         backgrounds,
         patches=designs,
-        options=TrainOptions(init, resume, minutes, processes, threads, tensorboard=tensorboard),
+        options=TrainOptions(init, resume, left(), processes, threads, tensorboard=tensorboard),
         say=lambda line: echo(line, err=True),
     )
     echo(f"{folder / 'checkpoint.safetensors'}: {'finished' if finished else 'go on with --resume'}")
     if finished and recipe.verifier is not None:
-        left = None if minutes is None else minutes - (time.monotonic() - began) / 60
         finished = make_weights(
-            recipe, folder, backgrounds, patches=designs, minutes=left, workers=processes, threads=threads, say=echo
+            recipe, folder, backgrounds, patches=designs, minutes=left(), workers=processes, threads=threads, say=echo
         )
         echo(f"{folder / 'weights'}: {'finished' if finished else 'go on with --resume'}")
 

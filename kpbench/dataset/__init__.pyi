@@ -2,9 +2,11 @@ from .card import Histogram as Histogram
 from .card import dataset_facts as dataset_facts
 from .card import dataset_histograms as dataset_histograms
 from .card import draw_overview as draw_overview
+from .card import draw_rungs as draw_rungs
 from .config import DatasetConfig as DatasetConfig
 from .drawing import draw_detections as draw_detections
 from .drawing import draw_keypoints as draw_keypoints
+from .drawing import enlarge_for_drawing as enlarge_for_drawing
 from .export import export_dataset as export_dataset
 from .folder import Dataset as Dataset
 from .folder import ShardEntry as ShardEntry

@@ -192,6 +192,49 @@ def draw_overview(dataset: Dataset | CocoDataset, count: int, columns: int, tile
     return contact_sheet(tiles, min(columns, len(chosen)))
 
 
+def draw_rungs(dataset: Dataset | CocoDataset, tile_width_px: int) -> UInt8:
+    """Draw a contact sheet of a suite: a row per condition, and in it one image per rung with its true keypoints.
+
+    All images show the same base scene and board, where the suite has one scene for all conditions.
+
+    Parameters
+    ----------
+    dataset : Dataset or CocoDataset
+        With conditions.
+    tile_width_px : int
+        Width of an image on the sheet.
+
+    Returns
+    -------
+    ndarray of shape (H, W, 3), uint8
+        RGB.
+
+    Examples
+    --------
+    >>> import kpbench
+    >>> from kpbench.dataset import draw_rungs
+    >>> config = kpbench.SuiteConfig(kpbench.load_suite("paper-v1"), images=1, size_px=(203, 155), only=("blur",))
+    >>> suite = kpbench.generate(config, "blurred", workers=1).dataset
+    >>> draw_rungs(suite, tile_width_px=100).shape  # four rungs
+    (102, 420, 3)
+    """
+    truth, tiles, titles = dataset.truth, list[UInt8](), list[str]()
+    conditions = list(dict.fromkeys(truth.condition.tolist()))
+    rungs = {name: np.unique(truth.rung[truth.condition == name]) for name in conditions}
+    columns = max(map(len, rungs.values()))
+    for name in conditions:
+        for rung in rungs[name]:
+            of_rung = np.flatnonzero((truth.condition == name) & ((truth.rung == rung) | np.isnan(rung)))
+            of_scene = of_rung[truth.scene_id[of_rung] == truth.scene_id[of_rung[0]]]
+            image, keypoints = dataset[int(of_scene[len(of_scene) // 2])]
+            tiles.append(draw_keypoints(image, keypoints, tile_width_px / image.shape[1], labels=False))
+            titles.append(name if np.isnan(rung) else f"{name} {rung:g}")
+        empty = columns - len(rungs[name])
+        tiles += [np.zeros((0, 0, 3), np.uint8)] * empty
+        titles += [""] * empty
+    return contact_sheet(tiles, columns, titles=titles)
+
+
 def write_card(dataset: Dataset | CocoDataset, folder: Path, usage: str = DATASET_USAGE) -> None:
     """Write the dataset card into a folder: ``README.md`` with the header that dataset hubs read, and ``preview.png``.
 
@@ -211,9 +254,7 @@ def write_card(dataset: Dataset | CocoDataset, folder: Path, usage: str = DATASE
     """
     card, picture = CARD_FILES
     if is_replaceable(folder / picture, "picture"):
-        write_file(
-            folder / picture, encode_png(draw_overview(dataset, count=12, columns=4, tile_width_px=320), "picture")
-        )
+        write_file(folder / picture, encode_png(draw_overview(dataset, 12, 4, tile_width_px=320), "picture"))
     if not is_replaceable(folder / card, "card"):
         return
     tables = "\n\n".join(map(_markdown_table, dataset_histograms(dataset)))

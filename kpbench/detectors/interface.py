@@ -24,13 +24,14 @@ from kpbench.errors import DataError
 from kpbench.files import read_bytes
 from kpbench.opencv import opencv_version
 from kpbench.patches.design import Patch
+from kpbench.text import did_you_mean
 from kpbench.types import Detections, UInt8
 from kpbench.validity import is_covariance
 
 DETECTORS = {
-    "template": "kpbench.detectors.template:TemplateDetector",
-    "superpoint": "kpbench.detectors.superpoint:SuperPointDetector",
     "superpoint-small": "kpbench.detectors.superpoint:SmallSuperPointDetector",
+    "superpoint": "kpbench.detectors.superpoint:SuperPointDetector",
+    "template": "kpbench.detectors.template:TemplateDetector",
     "orb": "kpbench.detectors.features:orb",
     "sift": "kpbench.detectors.features:sift",
     "aruco": "kpbench.detectors.tags:ArucoDetector",
@@ -40,6 +41,8 @@ DETECTORS = {
     "locus": "kpbench.detectors.tags:LocusDetector",
 }
 """Name of each shipped detector → its definition, as ``MODULE:ATTR``."""
+DEFAULT_DETECTOR = "superpoint-small"
+"""The detector of every command and function that is told none."""
 PROGRAM_PREFIX = "program:"
 """The part of a name after this prefix is a command line, see :func:`kpbench.detectors.program.run_program`."""
 
@@ -183,7 +186,7 @@ def load_detector(name: str, threshold: float | None = None, patches: Sequence[P
     if ":" not in DETECTORS.get(name, name):
         raise DataError(
             f"detector {name!r} is not known; there are: {', '.join(DETECTORS)}, or FILE.onnx, MODULE:ATTR "
-            "or program:COMMAND of your own"
+            f"or program:COMMAND of your own{did_you_mean(name, DETECTORS)}"
         )
     if name not in DETECTORS:
         _search_current_folder()

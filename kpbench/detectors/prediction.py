@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kpbench.dataset.drawing import draw_detections
+from kpbench.dataset.drawing import draw_detections, enlarge_for_drawing
 from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import LoadedDetector, in_one_line, load_detector
 from kpbench.detectors.inverted import InvertedPrints
@@ -68,6 +69,8 @@ class ImageResult(NamedTuple):
 
 Sink = Callable[[Predictions], None]
 """A function of the predictions of some images."""
+Decorate = Callable[[Detections, tuple[int, int], UInt8], None]
+"""A function of the detections of an image, its width and height in px, and its picture, RGB, that it draws into."""
 
 
 def predict(
@@ -77,6 +80,7 @@ def predict(
     threshold: float | None = None,
     workers: int | None = 1,
     overlay: Path | None = None,
+    decorate: Decorate | None = None,
     progress: Progress = lambda images: None,
     sink: Sink | None = None,
 ) -> PredictionRun:
@@ -96,7 +100,10 @@ def predict(
         OpenCV, BLAS and torch. A loaded detector always runs in the calling process, and so does
         any detector on images without truth.
     overlay : Path, optional
-        Folder or video file to draw the detections into.
+        Folder or video file to draw the detections into, see :func:`kpbench.dataset.draw_detections`. Small images are
+        enlarged. The pictures of a dataset also show the truth.
+    decorate : callable, optional
+        Draws more into each picture, such as the axes of a board.
     progress : callable
         Called with the number of images finished since the last call.
     sink : callable, optional
@@ -120,7 +127,8 @@ def predict(
     (6, ())
     """
     if isinstance(source, ImageSource):
-        return predict_images(source, detector, threshold=threshold, overlay=overlay, progress=progress, sink=sink)
+        options = {"threshold": threshold, "overlay": overlay, "decorate": decorate, "progress": progress, "sink": sink}
+        return predict_images(source, detector, **options)  # type: ignore[arg-type]
     dataset = source
     warn_of_opencv()
     loaded = load_detector(detector, threshold) if isinstance(detector, str) else detector
@@ -138,7 +146,7 @@ def predict(
             found.update(results)
             pass_on([*results.values()], [], ids[[*results]])
         for n in range(count) if overlay is not None else ():
-            draw(names[n], draw_detections(dataset.image(n), found[n].detections))
+            draw(names[n], _draw(loaded, dataset.image(n), found[n].detections, decorate, dataset.keypoints(n)))
     labels = [f"image_id {image_id}" for image_id in ids]
     return _finish(loaded, [found[n] for n in range(count)], labels, ids, dataset)
 
@@ -149,6 +157,7 @@ def predict_images(
     *,
     threshold: float | None = None,
     overlay: Path | None = None,
+    decorate: Decorate | None = None,
     progress: Progress = lambda images: None,
     sink: Sink | None = None,
 ) -> PredictionRun:
@@ -161,7 +170,7 @@ def predict_images(
     source : ImageSource
         From :func:`kpbench.images.open_images`. Ctrl-C ends a source of unknown length, such as a camera, and keeps the
         detections so far.
-    detector, threshold, overlay, progress, sink
+    detector, threshold, overlay, decorate, progress, sink
         As for :func:`predict`.
 
     Returns
@@ -197,9 +206,23 @@ def predict_images(
             found.append(result)
             labels.append(label)
             pass_on([result], [label], np.array([len(found) - 1]))
-            draw(label, None if image is None else draw_detections(image, result.detections))
+            drawn = None if image is None or overlay is None else _draw(loaded, image, result.detections, decorate)
+            draw(label, drawn)
             progress(1)
     return _finish(loaded, found, labels, np.arange(len(found)), source)
+
+
+def _draw(
+    detector: LoadedDetector,
+    image: UInt8,
+    found: Detections,
+    decorate: Decorate | None,
+    truth: NDArray[Any] | None = None,
+) -> UInt8:
+    """Return the picture of an image for ``overlay``."""
+    names = {patch.patch_id: patch.name for patch in detector.patches}
+    below = None if decorate is None else partial(decorate, found, _size(image))
+    return draw_detections(image, found, names, truth, enlarge_for_drawing(image), draw_below=below)
 
 
 def _finish(

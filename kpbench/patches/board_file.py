@@ -12,9 +12,12 @@ from kpbench.patches.board_sidecar import read_board_sidecar
 from kpbench.patches.design import Patch, load_patches, shipped_patches
 from kpbench.patches.field import FIELD_COLUMNS, FIELD_DIAMETER_MM, FIELD_ROWS, field_boards
 from kpbench.patches.reference_boards import TRUTH_DIAMETER_MM, truth_board
+from kpbench.text import did_you_mean
 from kpbench.toml import TomlTable, name_source, read_toml
 
 BOARD_FILE_SCHEMA = "kpbench.board-design/1"
+BOARD_NAMES = ("hexagon", "grid", "truth", "field")
+"""Boards that need no file."""
 GRID_PITCH = 2.0  # default pitch of a grid, in disc diameters
 DEFAULT_DIAMETER_MM = 30.0
 BOARD_KEYS = ("schema", "name", "designs", "size_mm", "diameter_mm", "field", "grid", "keypoint")
@@ -48,7 +51,8 @@ def find_patch(patches: Sequence[Patch], key: object) -> Patch:
     if len(found) != 1:
         known = ", ".join(f"{p.name} ({p.patch_id})" for p in patches)
         problem = "the name or ID of several designs" if found else "not known"
-        raise DesignError(f"patch {key!r} is {problem}; known are: {known}")
+        close = did_you_mean(str(key), [p.name for p in patches])
+        raise DesignError(f"patch {key!r} is {problem}; known are: {known}{close}")
     return found[0]
 
 
@@ -141,7 +145,8 @@ def load_boards(
     if name == "grid":
         return (grid_board(designs, 4, 3, diameter, GRID_PITCH * diameter),)
     if not Path(name).is_file():
-        raise DesignError(f"{name}: no such file, expected hexagon, grid, truth, field or a board's file")
+        problem = f"{name}: no such file, expected {', '.join(BOARD_NAMES)} or a board's file"
+        raise DesignError(problem + did_you_mean(str(name), BOARD_NAMES))
     return (load_board(name, patches, diameter_mm),)
 
 

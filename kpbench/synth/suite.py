@@ -41,6 +41,7 @@ from kpbench.synth.finish import degrade_scene, discs_of
 from kpbench.synth.suite_boards import BOARD_SIDE_MM, disc_outline, printed_share, suite_boards
 from kpbench.synth.suite_file import Condition, Suite
 from kpbench.synth.suite_view import View
+from kpbench.text import did_you_mean
 from kpbench.types import Float
 
 
@@ -125,7 +126,8 @@ class SuiteConfig:
         known = [c.name for c in self.suite.conditions]
         for name in self.only:
             if name not in known:
-                raise DataError(f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}")
+                problem = f"{self.suite.name} has no condition {name!r}, only: {', '.join(known)}"
+                raise DataError(problem + did_you_mean(name, known))
         _ = self.presets  # raises an error if a rung's camera is impossible
 
     @property

@@ -8,18 +8,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
+from kpbench.boards.drawing import draw_board
 from kpbench.boards.images import PoseRecord
-from kpbench.boards.pose import BoardPose
+from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.folder import Dataset
 from kpbench.errors import DataError
-from kpbench.geometry.camera import Camera
 from kpbench.images import UNDECODABLE, ImageSource, image_writer
-from kpbench.patches.board import Board
 from kpbench.tracking.tracker import TrackedPose, Tracker
-from kpbench.types import Float, UInt8
+from kpbench.types import Detections, UInt8
 from kpbench.workers import Progress
 
 STATE_COLOURS = {"seen": (0, 158, 115), "tracked": (86, 180, 233), "predicted": (213, 94, 0)}
@@ -152,37 +150,11 @@ def draw_pose(image: UInt8, found: TrackedPose, tracker: Tracker) -> UInt8:
     ndarray of shape (H, W, 3), uint8
         RGB.
     """
-    canvas = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB) if image.ndim == 2 else image.copy(), np.uint8)
+    detections = Detections.none() if found.match is None else found.match.detections
     pose = found.pose or found.filtered
-    if pose is None:
-        return canvas
-    board, camera = tracker.board, tracker.camera.at_size(image.shape[1], image.shape[0])
-    unit, length = max(1, round(max(image.shape) / 800)), min(board.side_x_mm, board.side_y_mm) / 4
-    for line_mm, colour in (
-        (_outline(board), STATE_COLOURS[found.state]),
-        *((np.array([np.zeros(3), length * axis]), tuple(int(255 * abs(c)) for c in axis)) for axis in _AXES),
-    ):
-        line = _project(camera, pose, line_mm)
-        if line is not None:
-            cv2.polylines(canvas, [np.rint(16 * line).astype(np.int32)], False, colour, 2 * unit, cv2.LINE_AA, 4)
-    for x, y in found.match.detections.xy.tolist() if found.match else ():
-        cv2.circle(canvas, (round(16 * x), round(16 * y)), 48 * unit, (255, 0, 0), unit, cv2.LINE_AA, 4)
-    return canvas
 
+    def draw_below(canvas: UInt8) -> None:
+        if pose is not None:
+            draw_board(canvas, tracker.board, pose, tracker.camera, STATE_COLOURS[found.state])
 
-_AXES = np.diag([1.0, 1.0, -1.0])
-
-
-def _outline(board: Board) -> Float:
-    x, y = board.side_x_mm / 2, board.side_y_mm / 2
-    return np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0], [-x, -y, 0]])
-
-
-def _project(camera: Camera, pose: BoardPose, line_mm: Float) -> Float | None:
-    """Return a line of the board in the image, px; None if the lens does not show it."""
-    ends = np.linspace(line_mm[:-1], line_mm[1:], 16, axis=1).reshape(-1, 3)
-    points = ends @ pose.rotation.T + pose.translation_mm
-    if points[:, 2].min() <= 0:
-        return None
-    rays = points[:, :2] / points[:, 2:]
-    return camera.distort(rays) if np.hypot(*rays.T).max() < camera.lens.largest_radius else None
+    return draw_detections(image, detections, labels=False, draw_below=draw_below)

@@ -28,9 +28,9 @@ from kpbench.training.batches import Batch, BatchJob, load_photos, training_batc
 from kpbench.training.checkpoint import TrainingState, restore_state, save_checkpoint, start_state
 from kpbench.training.process_group import ProcessGroup, join_process_group
 from kpbench.training.recipe import Recipe
-from kpbench.training.run_log import LossMeter, Timer, open_log, sample_bar
+from kpbench.training.run_log import LossMeter, Timer, open_log, training_bar
 from kpbench.training.step import train_step
-from kpbench.training.validation import ValidationSets, make_validation_sets, validate_network
+from kpbench.training.validation import ValidationSets, estimate_validation_s, make_validation_sets, validate_network
 from kpbench.training.weights import load_initial_weights
 
 SAVE_EVERY_S, REPORT_EVERY_S = 300.0, 20.0
@@ -49,8 +49,8 @@ class TrainOptions:
     resume : bool
         Resume from the checkpoint in the output folder.
     minutes : float, optional
-        Minutes after which this run stops. The training can be resumed later. None: the run lasts until the recipe is
-        finished.
+        Minutes after which this run stops, with its checkpoint and its last validation. The training can be resumed
+        later. None: the run lasts until the recipe is finished.
     workers : int
         Number of worker processes that make samples; 0: the training process makes the samples.
     threads : int, optional
@@ -188,11 +188,13 @@ class _Training:
         """
         group, options, leads = self.group, self.options, self.group.rank == 0
         validation = self.make_validation() if leads else []
+        validation_s = 0.0 if options.minutes is None else estimate_validation_s(state.mean, validation)
         forward: nn.Module = torch.compile(state.network) if self.recipe.compile else state.network  # type: ignore[assignment]
         before = state.seconds
+        stop_s = None if options.minutes is None else 60 * options.minutes - validation_s
         with (
             open_log(self.folder, leads, options.tensorboard) as record,
-            sample_bar(state, leads) as advance,
+            training_bar(state, leads, stop_s) as advance,
         ):
             saving, reporting, validating = (
                 Timer(SAVE_EVERY_S),
@@ -205,11 +207,12 @@ class _Training:
                 meter.add(train_step(state, forward, images, keypoints, group))
                 elapsed = time.monotonic() - self.began
                 state.seconds = before + elapsed
-                stop = group.any_of(bool(signals) or (options.minutes is not None and elapsed > 60 * options.minutes))
+                stop = group.any_of(bool(signals) or (stop_s is not None and elapsed > stop_s))
+                advance(state.step, elapsed)
                 last = stop or state.step == self.recipe.steps
                 if last or reporting.due():
                     figures = meter.read(state)
-                    advance(state.step, f"{figures['loss']:.4f} {figures['id_loss']:.4f}")
+                    advance(state.step, elapsed, f"loss {figures['loss']:.4f} id {figures['id_loss']:.4f}")
                     record(state, figures)
                     reporting.restart()
                 if leads and (last or saving.due()):

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from kpbench.errors import DataError
 from kpbench.files import shipped_folder
+from kpbench.text import did_you_mean
 from kpbench.toml import TomlTable, name_source, read_toml
 from kpbench.training.batches import SampleConfig
 
@@ -352,7 +353,10 @@ def load_recipe(name: str | Path) -> Recipe:
     shipped = shipped_recipes()
     path = shipped.get(str(name), Path(name))
     if str(name) not in shipped and path.suffix != ".toml":
-        raise DataError(f"there is no recipe {str(name)!r}, only: {', '.join(shipped)}, or a .toml file of your own")
+        raise DataError(
+            f"there is no recipe {str(name)!r}, only: {', '.join(shipped)}, or a .toml file of your own"
+            f"{did_you_mean(str(name), shipped)}"
+        )
     return parse_recipe(read_toml(path, DataError), str(path))
 
 

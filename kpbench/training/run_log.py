@@ -63,15 +63,22 @@ def open_log(folder: Path, active: bool, tensorboard: bool) -> Iterator[Record]:
 
 
 @contextmanager
-def sample_bar(state: TrainingState, active: bool) -> Iterator[Callable[[int, str], None]]:
-    """Show a progress bar that counts samples, only on a terminal; yield a function that sets its step and its text."""
-    batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
-    hidden = not active or not sys.stderr.isatty()
-    with tqdm(total=total, initial=state.step * batch, unit="crop", unit_scale=True, disable=hidden) as bar:
+def training_bar(state: TrainingState, active: bool, stop_s: float | None) -> Iterator[Callable[..., None]]:
+    """Show a progress bar, only on a terminal; yield a function that takes its step, its seconds and its text.
 
-        def advance(step: int, text: str) -> None:
-            bar.set_postfix_str(text, refresh=False)
-            bar.update(step * batch - bar.n)
+    The bar counts samples. With ``stop_s``, the seconds at which the training stops, the bar counts seconds.
+    """
+    batch, total = state.recipe.batch, state.recipe.steps * state.recipe.batch
+    count: dict[str, Any] = {"total": total, "initial": state.step * batch, "unit": "crop", "unit_scale": True}
+    if stop_s is not None:
+        count = {"total": max(round(stop_s), 1), "bar_format": "{l_bar}{bar}| {n:.0f} of {total} s{postfix}"}
+    hidden = not active or not sys.stderr.isatty()
+    with tqdm(desc="train", disable=hidden, **count) as bar:
+
+        def advance(step: int, seconds: float, text: str = "") -> None:
+            if text:
+                bar.set_postfix_str(f"step {step}, {text}", refresh=False)
+            bar.update(step * batch - bar.n if stop_s is None else min(seconds, stop_s) - bar.n)
 
         yield advance
 

@@ -13,7 +13,7 @@ from helpers import kpbench
 
 from kpbench.dataset.drawing import draw_detections
 from kpbench.dataset.generation import generate
-from kpbench.detectors.interface import LoadedDetector, load_detector
+from kpbench.detectors.interface import DEFAULT_DETECTOR, DETECTORS, LoadedDetector, load_detector
 from kpbench.detectors.prediction import predict_images
 from kpbench.errors import DataError
 from kpbench.geometry.camera import Camera
@@ -202,7 +202,7 @@ def test_one_image_is_drawn_into_one_file_and_more_into_a_folder(folder, plug):
     for n in range(2):
         cv2.imwrite(str(folder / "two" / f"{n}.png"), np.full((24, 32), 90, np.uint8))
     kpbench("detect", "two/0.png", "--detector", f"{plug}:brightest", "--overlay", "drawn.png")
-    assert cv2.imread("drawn.png").shape == (24, 32, 3)
+    assert cv2.imread("drawn.png").shape == (96, 128, 3)
     refused = kpbench("detect", "two", "--detector", f"{plug}:brightest", "--overlay", "other.png", code=1)
     assert "there is more than one image, expected a folder" in refused.output
 
@@ -512,3 +512,40 @@ def test_what_is_wrong_with_boards_and_cameras_is_one_line(film, options, code, 
     assert message in done.stderr
     assert code == 2 or len(done.stderr.splitlines()) == 1
     assert not Path("preds.json").exists()
+
+
+def test_a_single_image_is_drawn_and_its_detections_are_printed(folder, plug):
+    photos(folder)
+    lines = kpbench("detect", "photos/0.png", "--detector", f"{plug}:brightest").stdout.splitlines()
+    assert lines[0] == f"photos/0.png: 2 detections by {plug}:brightest"
+    assert [line.split() for line in lines[1:]] == [
+        ["ID", "name", "x", "px", "y", "px", "radius", "px", "score"],
+        ["1", "-", "20.00", "10.00", "-", "1.00"],
+        ["0", "-", "0.00", "0.00", "-", "0.20"],
+        ["0-found.png"],
+    ]
+    assert sorted(path.name for path in folder.iterdir() if path.is_file() and path.suffix != ".py") == ["0-found.png"]
+    assert not kpbench(
+        "detect", "photos/0.png", "--detector", f"{plug}:brightest"
+    ).stderr  # its own drawing is replaced
+    (folder / "0-found.png").write_bytes((folder / "photos" / "0.png").read_bytes())
+    assert "0-found.png" in kpbench("detect", "photos/0.png", "--detector", f"{plug}:brightest", code=1).stderr
+    kpbench("detect", "photos/0.png", "--detector", f"{plug}:brightest", "--out", "one.json")
+    assert "draws them" in kpbench("detect", "photos", "--detector", f"{plug}:brightest").stdout
+
+
+def test_a_single_image_tells_the_pose_of_a_board(film):
+    boards = ("--board", "square.toml", "--camera", "camera.yaml")
+    found = kpbench("detect", "photos/0.png", "--detector", film, *boards, "--poses", "p.csv", "--overlay", "drawn.png")
+    [line] = [line for line in found.stdout.splitlines() if line.startswith("board")]
+    assert line == "board square: 4 points, 350 mm away, tilted by 0.0 degrees, reprojection error 0.00 px"
+    x_axis = cv2.imread("drawn.png")[480, 660:700]  # the picture is enlarged; the axis begins at the board's middle
+    assert (x_axis.astype(int) @ [-1, -1, 2] > 100).any()
+    assert Path("p.csv").exists()
+
+
+def test_the_help_names_every_detector():
+    text = kpbench("detect", "--help").stdout
+    assert {*re.findall(r"[\w-]+", text)} >= {*DETECTORS}
+    assert "superpoint-small    small network, the default" in text
+    assert DEFAULT_DETECTOR == "superpoint-small"

@@ -1,10 +1,11 @@
 import re
 
 import pytest
+from click.testing import CliRunner
 from helpers import command, kpbench
 
 from kpbench import Detections, Predictions, write_predictions
-from kpbench.cli import COMMANDS
+from kpbench.cli import COMMANDS, main
 from kpbench.cli.messages import OPTION_OF, name_options
 
 
@@ -86,3 +87,36 @@ def test_a_message_of_the_library_names_options_of_the_command(workplace, datase
     options = {option for param in about.params for option in param.opts}
     assert {*re.findall(r"(?<![\w-])--[a-z][\w-]*", message)} <= options
     assert name_options(message, about) == message, "a parameter is left in backticks"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "close"),
+    [
+        (["detct"], 2, "detect"),
+        (["detect", "--detctor", "x"], 2, "--detector"),
+        (["demo", "--detector", "suprpoint"], 1, "superpoint"),
+        (["suite", "paper-v"], 1, "paper-v1"),
+        (["suite", "paper-v1", "--camera", "webcm"], 1, "webcam"),
+        (["suite", "paper-v1", "--only", "blurr"], 1, "blur"),
+        (["render-patches", "--board", "hexagn"], 1, "hexagon"),
+        (["render-patches", "--board", "hexagon", "--patch", "trefol"], 1, "trefoil"),
+        (["train", "--config", "referenc"], 1, "reference"),
+        (["score", "x.json", "--min", "detction_score=1"], 2, "detection_score"),
+    ],
+)
+def test_a_mistyped_name_is_answered_with_the_closest(here, arguments, code, close):
+    assert f"id you mean '{close}'?" in kpbench(*arguments, code=code).stderr
+
+
+@pytest.mark.parametrize(
+    ("shell", "begins"), [("bash", "_kpbench_completion"), ("zsh", "#compdef kpbench"), ("fish", "function _kpbench")]
+)
+def test_each_shell_gets_a_script_that_completes(shell, begins):
+    script = CliRunner().invoke(main, env={"_KPBENCH_COMPLETE": f"{shell}_source"}, prog_name="kpbench").output
+    assert script.lstrip().startswith(begins)
+    asked = {
+        "_KPBENCH_COMPLETE": f"{shell}_complete",
+        "COMP_WORDS": "kpbench det",
+        "COMP_CWORD": "det" if shell == "fish" else "1",
+    }
+    assert "detect" in CliRunner().invoke(main, env=asked, prog_name="kpbench").output

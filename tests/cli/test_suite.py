@@ -12,7 +12,7 @@ def test_the_suite_command(tmp_path):
     unknown = kpbench("suite", "paper-v9", code=1)
     assert unknown.stderr == (
         "kpbench: there is no suite 'paper-v9', only: camera-v1, extended-v1, extended-v2, paper-v1, video-v1, "
-        "or a .toml file of your own\n"
+        "or a .toml file of your own; did you mean 'paper-v1'?\n"
     )
     kpbench("suite", "paper-v1", "--distortion", "much", code=2)
 

@@ -58,7 +58,7 @@ def test_a_detector_of_ones_own_is_a_function_a_class_or_an_object(module, attri
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("tamplate", "detector 'tamplate' is not known; there are: template"),
+        ("tamplate", "detector 'tamplate' is not known; there are: superpoint-small"),
         ("no_such_module_here:f", "there is no module 'no_such_module_here'"),
         ("{module}:f", "has no attribute 'f'"),
         ("{module}:nothing", "cannot be called and has no method detect"),

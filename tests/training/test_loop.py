@@ -16,6 +16,7 @@ from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.errors import DataError
 from kpbench.files import PACKAGE, protect_read_files
 from kpbench.patches.design import shipped_patches
+from kpbench.training import loop
 from kpbench.training.batches import Batch, SampleConfig
 from kpbench.training.checkpoint import load_mean_network, read_checkpoint, start_state
 from kpbench.training.export import export_onnx
@@ -81,6 +82,19 @@ def test_interrupted_and_resumed_equals_undisturbed_to_the_bit(tmp_path, run, st
     with protect_read_files():  # as the command does; the checkpoint that is read is replaced
         assert run(recipe, tmp_path / "parts", resume=True)
     assert same(tensors(tmp_path / "whole"), tensors(tmp_path / "parts"))
+
+
+def test_the_minutes_hold_the_last_validation_and_a_bar_shows_them(tmp_path, run, monkeypatch, capsys):
+    monkeypatch.setattr(loop, "estimate_validation_s", lambda network, sets: 3600.0)  # no time is left for training
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+    assert not run(RECIPE, tmp_path, minutes=60.0)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [1, 1]
+    assert "clean_found_3px" in lines[-1]
+    bar = capsys.readouterr().err
+    assert "train" in bar
+    assert "step 1, loss" in bar
+    assert run(RECIPE, tmp_path, resume=True)
 
 
 @pytest.mark.parametrize(
