@@ -150,19 +150,22 @@ def verify_candidates(
         chosen = select_distinct(corrected, log_odds, LEAST_FIT_LOG_ODDS)
         fitted = fit_hypotheses(pyramids, corrected[chosen], log_odds[chosen], patches)
     log_odds, _ = judge(SECOND_JUDGE, fitted, patches, threads, weights)
-    near = _count_near(fitted, xy, np.zeros(len(xy), np.int64) if octave is None else octave)
-    log_odds = log_odds - np.log(np.maximum(1.0, near / USUAL_PLACES))  # more candidates do not mean more patches
+    log_odds = discount_crowds(log_odds, fitted, xy, np.zeros(len(xy), np.int64) if octave is None else octave)
     best = select_likeliest(fitted.place, log_odds)
     best = best[clipped_semi_axis(fitted.A[best]) >= LEAST_SEMI_AXIS_PX]
     found, score = fitted[best], 1 / (1 + np.exp(-log_odds[best]))
     return VerifiedCandidates(found.place, found.design, found.xy, found.A, found.covariance, found.blur_px, score)
 
 
-def _count_near(hypotheses: Hypotheses, xy: Float, octave: Int) -> Int:
-    """Return the number (n,) of candidates, of equal or coarser pictures, in the square around each hypothesis."""
+def discount_crowds(log_odds: Float, hypotheses: Hypotheses, xy: Float, octave: Int) -> Float:
+    """Return the log odds (n,) of hypotheses, lowered where there are many candidates: these do not mean more patches.
+
+    ``xy`` (m, 2), ``octave`` (m,) : all candidates of the image. Those of equal or coarser pictures in the square
+    around a hypothesis count, see ``USUAL_PLACES``.
+    """
     distance = np.abs(hypotheses.place_xy[:, None] - xy).max(axis=2) * 0.5 ** hypotheses.octave[:, None]
     near = (distance < SURROUNDINGS_PX / 2) & (octave >= hypotheses.octave[:, None])
-    return np.asarray(np.count_nonzero(near, axis=1))
+    return np.asarray(log_odds - np.log(np.maximum(1.0, np.count_nonzero(near, axis=1) / USUAL_PLACES)))
 
 
 def find_ellipses(

@@ -23,6 +23,10 @@ from kpbench.types import Float, UInt8
 
 CACHE_BYTES = 128 * 2**20
 """Largest size of the cache of decoded photographs of a :class:`PhotoFolder`, bytes."""
+PHOTO_PARTS = ("all", "training", "validation")
+"""Parts of a folder of photographs."""
+VALIDATION_EVERY = 10
+"""One of so many photographs of a folder is for validation, and trains nothing."""
 LEAVES = 700
 """Number of shapes in a procedural background. In an image of 640x480 px, the areas of the shapes sum to about the area
 of the image."""
@@ -34,6 +38,11 @@ TEXTURE_UNIT = 32
 """Whole numbers per grey level in the texture of a procedural background. OpenCV interpolates whole numbers exactly."""
 TEXTURE_OCTAVES = 7
 """Number of noise layers in a procedural background. Each layer has half the resolution of the previous one."""
+
+
+def is_in_part(number: int, part: str) -> bool:
+    """Return whether the photograph with this number, from 0, belongs to one of ``PHOTO_PARTS``."""
+    return part == "all" or (number % VALIDATION_EVERY == 0) == (part == "validation")
 
 
 @dataclass(frozen=True)
@@ -85,8 +94,15 @@ class PhotoFolder:
     _cached_bytes: int = 0
 
     @classmethod
-    def open(cls, path: str | Path) -> PhotoFolder:
+    def open(cls, path: str | Path, part: str = "all") -> PhotoFolder:
         """List a folder and make sure that at least one photograph in the folder can be decoded.
+
+        Parameters
+        ----------
+        path : path
+        part : str
+            "validation" (every tenth photograph), "training" (the others), or "all". If the folder holds only one
+            photograph, the photograph belongs to both parts.
 
         Raises
         ------
@@ -104,6 +120,8 @@ class PhotoFolder:
         photos = cls(folder, files)
         if all(photos.decode(name, 1) is None for name in files):
             raise DataError(f"{folder}: none of its {len(files)} image files can be decoded, first is {files[0]}")
+        if len(files) > 1:
+            photos.files = tuple(file for n, file in enumerate(files) if is_in_part(n, part))
         return photos
 
     @property

@@ -18,7 +18,7 @@ from kpbench.degrade.ladder import draw_ladder_mix, draw_paper_mix
 from kpbench.errors import DataError
 from kpbench.memory import require_memory
 from kpbench.patches.design import Patch, shipped_patches
-from kpbench.render.background import Background, PhotoFolder, describe_backgrounds, procedural_background
+from kpbench.render.background import PHOTO_PARTS, Background, PhotoFolder, describe_backgrounds, procedural_background
 from kpbench.render.lookalikes import draw_lookalikes
 from kpbench.render.placement import Limits, random_placements
 from kpbench.render.scene import render_scene
@@ -63,6 +63,8 @@ class SynthConfig:
         Images per shard; changes the files but no image.
     backgrounds : Path or None
         Folder of photographs, or None for procedural backgrounds.
+    photo_part : {"all", "training", "validation"}
+        Which photographs of the folder are used, see :meth:`kpbench.render.PhotoFolder.open`.
     distractors : int
         Largest number of look-alikes per image, see :func:`kpbench.render.draw_lookalikes`. The patches of a scene
         do not depend on ``distractors``.
@@ -98,6 +100,7 @@ class SynthConfig:
     deteriorate: str = "paper"
     shard_size: int = 500
     backgrounds: Path | None = None
+    photo_part: str = "all"
     distractors: int = 0
     camera: CameraPreset | None = None
     augmentation: str | None = None
@@ -115,6 +118,10 @@ class SynthConfig:
             (
                 self.size_px[0] * self.size_px[1] <= MOST_SYNTH_PIXELS,
                 f"`size_px` is {size}, expected at most {MOST_SYNTH_PIXELS} pixels",
+            ),
+            (
+                self.photo_part in PHOTO_PARTS,
+                f"`photo_part` is {self.photo_part!r}, expected one of {', '.join(PHOTO_PARTS)}",
             ),
             (self.channels in (1, 3), f"`channels` is {self.channels}, expected 1 or 3"),
             (
@@ -146,7 +153,7 @@ class SynthConfig:
     @cached_property
     def photos(self) -> PhotoFolder | None:
         """The opened folder of photographs; None for procedural backgrounds."""
-        return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds)
+        return None if self.backgrounds is None else PhotoFolder.open(self.backgrounds, self.photo_part)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the config that is written into the dataset.

@@ -19,15 +19,13 @@ from kpbench.degrade.ladder import apply_effects, draw_paper_mix
 from kpbench.errors import DataError
 from kpbench.images import decode_photo
 from kpbench.patches.design import Patch
-from kpbench.render.background import PhotoFolder, procedural_background
+from kpbench.render.background import PhotoFolder, is_in_part, procedural_background
 from kpbench.render.placement import Limits, random_placements
 from kpbench.render.scene import render_scene
 from kpbench.training.crops import MOST_KEYPOINTS, cut_window, empty_keypoints, make_crops
 from kpbench.types import Float32, UInt8
 from kpbench.workers import run_in_order
 
-VALIDATION_EVERY = 10
-"""Every tenth photograph is kept for validation."""
 PHOTO_PX = 640
 """Longest side of a photograph, px; larger photographs are shrunk."""
 LEAST_PHOTO_PX = 8
@@ -105,8 +103,7 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     folder : path or None
         Folder of photographs. None: 64 procedural textures replace the photographs.
     part : str
-        "validation" (every tenth photograph) or "training" (the others). If the folder holds only one photograph, the
-        photograph belongs to both parts.
+        "validation" or "training", see :meth:`kpbench.render.PhotoFolder.open`.
 
     Raises
     ------
@@ -120,20 +117,16 @@ def load_photos(folder: str | Path | None, part: str) -> list[UInt8]:
     >>> len(textures), textures[0].shape
     (7, (480, 640))
     """
-
-    def kept(n: int, count: int) -> bool:
-        return count == 1 or (n % VALIDATION_EVERY == 0) == (part == "validation")
-
     if folder is None:
-        return [procedural_background(np.random.default_rng([2410, n]), 640, 480) for n in range(64) if kept(n, 64)]
-    photos = PhotoFolder.open(folder)
-    files = [name for n, name in enumerate(photos.files) if kept(n, len(photos.files))]
-    read = (decode_photo(photos.path / name, 1) for name in files)
+        numbers = [n for n in range(64) if is_in_part(n, part)]
+        return [procedural_background(np.random.default_rng([2410, n]), 640, 480) for n in numbers]
+    photos = PhotoFolder.open(folder, part)
+    read = (decode_photo(photos.path / name, 1) for name in photos.files)
     shrunk = (_shrink(image) for image in read if image is not None)
     good = [image for image in shrunk if min(image.shape) >= LEAST_PHOTO_PX]
     if not good:
         raise DataError(
-            f"{folder}: none of the {len(files)} photographs for {part} can be decoded (every tenth validates)"
+            f"{folder}: none of the {len(photos.files)} photographs for {part} can be decoded (every tenth validates)"
         )
     return good
 

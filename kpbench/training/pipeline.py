@@ -48,7 +48,8 @@ def make_weights(
     2. The datasets of the recipe are made.
     3. The ellipse network is trained on the candidates of the new network.
     4. Judges are trained on first looks alone, on the first datasets.
-    5. The judges that are kept are trained on poses that the judges of step 4 have corrected.
+    5. The judges that are kept are trained on poses that the judges of step 4 have corrected. Their threshold is placed
+       on the test dataset, whose photographs trained nothing.
 
     The folder ``weights`` then holds a detector: ``NAME-int8.onnx`` with the networks beside it.
 
@@ -99,7 +100,8 @@ def make_weights(
     judges = partial(train_judges, detector=small, workers=workers, threads=threads, say=say)
 
     def data(part: VerifierSet) -> Dataset:
-        return _make_dataset(part, folder / SETS_FOLDER, backgrounds, patches, workers)
+        photo_part = "validation" if part is config.test else "training"
+        return _make_dataset(part, folder / SETS_FOLDER, backgrounds, photo_part, patches, workers)
 
     def train_ellipses() -> None:
         ellipse([data(s) for s in config.sets], data(config.test), weights, epochs=config.ellipse_epochs)
@@ -110,7 +112,8 @@ def make_weights(
         write_file(first / f"{ELLIPSE}.onnx", read_bytes(weights / f"{ELLIPSE}.onnx"))
 
     def train_kept_judges() -> None:
-        judges([data(s) for s in config.sets], data(config.test), weights, weights=first, epochs=config.judge_epochs)
+        sets, kept = [data(s) for s in config.sets], partial(judges, alarms_per_image=config.alarms_per_image)
+        kept(sets, data(config.test), weights, weights=first, epochs=config.judge_epochs)
 
     steps: list[tuple[Path, Callable[[], object]]] = [
         (network, lambda: export_onnx(folder / "checkpoint.safetensors", network)),
@@ -137,7 +140,12 @@ def _dataset_folder(part: VerifierSet, folder: Path) -> Path:
 
 
 def _make_dataset(
-    part: VerifierSet, folder: Path, backgrounds: str | Path | None, patches: tuple[Patch, ...], workers: int
+    part: VerifierSet,
+    folder: Path,
+    backgrounds: str | Path | None,
+    photo_part: str,
+    patches: tuple[Patch, ...],
+    workers: int,
 ) -> Dataset:
     """Make the dataset of a set, or open it if it has been made; an unfinished one is continued."""
     out = _dataset_folder(part, folder)
@@ -149,6 +157,7 @@ def _make_dataset(
         size_px=part.size,
         deteriorate=part.deteriorate,
         backgrounds=None if backgrounds is None else Path(backgrounds),
+        photo_part=photo_part,
         distractors=part.distractors,
         camera=None if part.camera == "none" else load_camera_preset(part.camera),
         limits=Limits.of_radius(*part.radius_px) if part.radius_px else Limits(),

@@ -190,6 +190,9 @@ class VerifierConfig:
     first_sets : int
         Number of ``sets``, from the first one on, that train judges which only serve to correct poses for the judges
         that are kept.
+    alarms_per_image : float
+        Largest number of false alarms per image of ``test`` at a score of 0.5, from which on a detector reports. All
+        photographs of ``test`` are photographs that trained nothing.
 
     Examples
     --------
@@ -203,6 +206,7 @@ class VerifierConfig:
     ellipse_epochs: int = 6
     judge_epochs: int = 10
     first_sets: int = 1
+    alarms_per_image: float = 0.04
 
     def __post_init__(self) -> None:
         if not self.sets or min(s.images for s in (*self.sets, self.test)) < 1:

@@ -5,13 +5,16 @@ import shutil
 import numpy as np
 import pytest
 
+from kpbench.dataset.folder import open_dataset
 from kpbench.detectors.superpoint import SuperPointDetector
 from kpbench.detectors.verification import VERIFIER_NETWORKS
 from kpbench.errors import DataError
+from kpbench.images import to_grey
 from kpbench.patches.design import shipped_patches
 from kpbench.training.loop import TrainOptions, train
 from kpbench.training.pipeline import make_weights
 from kpbench.training.recipe import load_recipe, parse_recipe
+from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
 
 CONTENT = {
     "name": "tiny",
@@ -64,6 +67,20 @@ def test_the_weights_are_a_detector_that_verifies_with_the_networks_beside_it(ma
     alone = SuperPointDetector(tmp_path / "alone.onnx")
     assert own.version != alone.version
     own(np.full((96, 96), 128, np.uint8))
+
+
+def test_the_threshold_leaves_no_false_alarm_too_many_on_the_test_images(made):
+    folder, _ = made
+    test, weights = open_dataset(folder / "sets" / "paper-none-usual-3"), folder / "weights" / "tiny-int8.onnx"
+    counts = []
+    for threshold in (0.0, None):
+        detector, wrong = SuperPointDetector(weights, threshold=threshold), 0
+        for image, keypoints in test:
+            found = detector(to_grey(image))
+            wrong += int((~mark_correct(found.xy, found.patch_id, keypoints, FIT_TOLERANCE)).sum())
+        counts.append(wrong)
+    assert counts[0] > 0  # without a threshold there are false alarms
+    assert counts[1] == 0  # 0.04 of two images is less than one
 
 
 def test_a_damaged_network_beside_the_weights_is_one_line(made, tmp_path):

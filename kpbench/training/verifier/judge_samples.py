@@ -32,7 +32,7 @@ from kpbench.fitting.pyramid import Pyramids
 from kpbench.training.verifier.dataset_images import ImageRef, load_places_detector
 from kpbench.training.verifier.judge_network import Judge, apply_judge
 from kpbench.training.verifier.labels import FIT_TOLERANCE, mark_correct
-from kpbench.types import Float, UInt8
+from kpbench.types import Float, Int, UInt8
 
 TRAINING_MARGIN = 1.0
 """Amount by which training lowers two log-odds thresholds: ``SECOND_LOOK_LOG_ODDS`` and ``LEAST_FIT_LOG_ODDS``."""
@@ -48,8 +48,8 @@ class ImageLooks:
     ----------
     keypoints : structured ndarray
         The true keypoints.
-    candidate_score : ndarray of shape (n,)
-        Score that the detector's network gives each candidate.
+    candidate_xy, candidate_octave, candidate_score : ndarray of shape (n, 2), (n,) and (n,)
+        Place of each candidate, px; pyramid level in which it was found; score that the detector's network gives it.
     candidate_right : ndarray of shape (n,), bool
         Whether each candidate, with its likeliest design, is right.
     first_look, second_look : Hypotheses
@@ -59,6 +59,8 @@ class ImageLooks:
     """
 
     keypoints: NDArray[Any]
+    candidate_xy: Float
+    candidate_octave: Int
     candidate_score: Float
     candidate_right: NDArray[np.bool_]
     first_look: Hypotheses
@@ -115,7 +117,8 @@ def collect_looks(detector_path: Path | None, weights: Path, image: ImageRef, tr
         log_odds = np.concatenate([log_odds, second_log_odds])
     else:
         second_look, log_odds = first_look[:0], np.zeros(len(first_look))
-    return ImageLooks(keypoints, score, right, _halve_memory(first_look), _halve_memory(second_look), log_odds)
+    seen = _halve_memory(first_look), _halve_memory(second_look)
+    return ImageLooks(keypoints, xy, octave, score, right, *seen, log_odds)
 
 
 def _halve_memory(hypotheses: Hypotheses) -> Hypotheses:

@@ -13,6 +13,8 @@ wrong hypotheses, and to correct their poses. :func:`kpbench.training.verifier.l
    likely.
 4. The second judge is trained on the fitted hypotheses. The centre of a right hypothesis may now be 0.1 long semi-axes
    away from the keypoint.
+5. The log odds of the second judge are shifted, so that a score of 0.5 gives a wanted rate of false alarms on the test
+   dataset (:func:`kpbench.training.verifier.judge_report.place_threshold`).
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from kpbench.files import make_folder
 from kpbench.patches.design import Patch
 from kpbench.training.verifier.dataset_images import load_places_detector, map_images
 from kpbench.training.verifier.judge_network import Judge, input_tensors
-from kpbench.training.verifier.judge_report import report_judges
+from kpbench.training.verifier.judge_report import place_threshold, report_judges
 from kpbench.training.verifier.judge_samples import ImageLooks, collect_fits, collect_looks
 from kpbench.training.verifier.labels import FIT_TOLERANCE, POSE_TOLERANCE, label_hypotheses, pose_errors
 from kpbench.training.verifier.small_networks import (
@@ -68,6 +70,7 @@ def train_judges(
     detector: Path | None = None,
     weights: Path | None = None,
     epochs: int = 10,
+    alarms_per_image: float = 0.04,
     batch: int = 256,
     from_shipped: bool = False,
     workers: int = 1,
@@ -85,6 +88,8 @@ def train_judges(
         ``superpoint-small``.
     weights : Path, optional
         Folder of the ellipse network, and of the earlier first judge, if there is one. None: the shipped networks.
+    alarms_per_image : float
+        Largest number of false alarms per test image at a score of 0.5, from which on a detector reports.
 
     Raises
     ------
@@ -117,6 +122,7 @@ def train_judges(
         fits.append(map_images(work, part, [image.first_look for image in of_part], workers, f"fit {n}"))
     truths = [image.keypoints for part in looks[:-1] for image in part]
     second = _train_second([image.fitted for part in fits[:-1] for image in part], truths, settings)
+    place_threshold(looks[-1], fits[-1], second, patches, alarms_per_image, say)
     report_judges(looks[-1], fits[-1], second, patches, say)
     for name, network, seen in (
         (FIRST_JUDGE, first, [image.first_look for image in looks[-1]]),
