@@ -199,7 +199,7 @@ def label(
     }
     config = _LabelConfig(
         tuple(paths[o.photo.name] for o in kept),
-        tuple(keypoints),
+        tuple(np.concatenate([table, found.ignored]) for table, found in zip(keypoints, labels, strict=True)),
         tuple(_condition(o, condition, board, bundle, observed) for o in kept),
         content,
     )

@@ -31,6 +31,8 @@ class PhotoLabels:
     Attributes
     ----------
     keypoints : ndarray of shape (n,), LABELLED_KEYPOINT_DTYPE
+    ignored : ndarray of shape (m,), LABELLED_KEYPOINT_DTYPE
+        Patches inside of the image that have no label, so that nobody judges a detection there.
     unlabelled : dict of str to int
         Number of keypoints without label, by reason: ``outside`` of the image, outside of the ``hull`` of the marks
         that were found, ``covered``.
@@ -41,6 +43,7 @@ class PhotoLabels:
     """
 
     keypoints: NDArray[Any]
+    ignored: NDArray[Any]
     unlabelled: dict[str, int]
     leave_one_out: LeaveOneOut
     rolling_px: float
@@ -67,27 +70,28 @@ def label_photo(bundle: Bundle, n: int, board: Board, board_mm: Float, image: UI
     found = field.predict(centres, base.by_pose)
     xy = base.xy + found.mean
     table, unlabelled = np.zeros(len(centres), LABELLED_KEYPOINT_DTYPE), Counter[str]()
-    keep = list[int]()
+    is_judged = np.zeros(len(centres), bool)
     for k, keypoint in enumerate(board.keypoints):
         x, y = xy[k].tolist()
         if not (-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5):
             unlabelled["outside"] += 1
             continue
-        if cv2.pointPolygonTest(hull, (float(centres[k, 0]), float(centres[k, 1])), False) < 0:
-            unlabelled["hull"] += 1
-            continue
         H = _first_order_map(bundle, n, keypoint, found.mean[k])
         sight = look_at_patch(image, H, keypoint.patch)
-        if not sight.is_seen:
+        truth = (x, y, keypoint.patch_id, *_ellipse(bundle, n, keypoint), H, sight.inside, sight.contrast)
+        table[k] = (*truth, np.inf, np.inf, 0.0)  # ignored
+        if cv2.pointPolygonTest(hull, (float(centres[k, 0]), float(centres[k, 1])), False) < 0:
+            unlabelled["hull"] += 1
+        elif not sight.is_seen:
             unlabelled["covered"] += 1
-            continue
-        (xx, xy_), (_, yy) = found.covariance[k]
-        sigma_x, sigma_y = np.sqrt([xx, yy])
-        ellipse = _ellipse(bundle, n, keypoint)
-        truth = (x, y, keypoint.patch_id, *ellipse, H, sight.inside, sight.contrast)
-        table[k] = (*truth, sigma_x, sigma_y, xy_ / (sigma_x * sigma_y))
-        keep.append(k)
-    return PhotoLabels(table[keep], dict(unlabelled), leave_one_out, rolling_px)
+        else:
+            (xx, xy_), (_, yy) = found.covariance[k]
+            sigma_x, sigma_y = np.sqrt([xx, yy])
+            table[k] = (*truth, sigma_x, sigma_y, xy_ / (sigma_x * sigma_y))
+            is_judged[k] = True
+    is_there = table["radius_major"] > 0
+    parts = table[is_judged], table[is_there & ~is_judged]
+    return PhotoLabels(*parts, dict(unlabelled), leave_one_out, rolling_px)
 
 
 def _fit(bundle: Bundle, n: int, board_mm: Float) -> tuple[ResidualField, LeaveOneOut, float]:

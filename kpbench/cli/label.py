@@ -91,6 +91,8 @@ def label(
     keypoints = len(result.dataset.truth.keypoints)
     echo(f"{out}: {keypoints} keypoints in {len(result.dataset)} of {len(result.observed)} {config['source']}")
     echo(f"not labelled: {unlabelled or 'none'}")
+    if (ignored := result.dataset.truth.ignored) is not None:
+        echo(f"{len(ignored)} of these lie in the images, and scores ignore detections there")
     echo(
         f"error of the truth: {result.error_px:.4f} px a coordinate, by leaving out each mark "
         f"(marks: {result.leave_one_out_px:.4f} px)"

@@ -82,6 +82,8 @@ def test_covered_patches_and_those_outside_the_marks_are_not_labelled(photos, tm
     found = {photo["name"]: photo["unlabelled"] for photo in result.dataset.config["photos"]}
     assert found["03.png"] == {"covered": 2}
     assert sum(found["04.png"].values()) >= 4
+    ignored = result.dataset.ignored([*found].index("03.png"))
+    np.testing.assert_allclose(ignored["x"], truth["03.png"]["x"][[2, 5]], atol=0.05)
     table, true = match_truth(result.dataset, truth)
     assert np.hypot(table["x"] - true["x"], table["y"] - true["y"]).max() < 0.05
 

@@ -206,9 +206,11 @@ def coco(data: bytes, found: Any) -> str:
     if truth.image_id.tolist() != ids:
         return "image ids differ"
     expected: dict[int, list[tuple[float, ...]]] = {image_id: [] for image_id in ids}
+    crowds: dict[int, list[tuple[float, ...]]] = {image_id: [] for image_id in ids}
     for entry in content["annotations"]:
         x, y, v = map(number, entry["keypoints"])
-        if v > 0:
+        is_crowd = entry.get("iscrowd") == 1
+        if v > 0 or (is_crowd and not (entry.get("radius_major") is None and entry.get("radius") is None)):
             major = entry.get("radius_major")
             major = number(entry["radius"] if major is None else major)
             minor = entry.get("radius_minor")
@@ -217,12 +219,15 @@ def coco(data: bytes, found: Any) -> str:
                 raise Refusal("a radius of 0 or less")
             angle, visible = number(entry.get("axis_angle", 0.0)), number(entry.get("visible", 1.0))
             sizes = np.array([major, minor, angle, visible], np.float32).astype(float).tolist()
-            expected[whole(entry["image_id"])].append((x, y, whole(entry["category_id"], 2**15) - 1, *sizes))
+            rows = crowds if is_crowd else expected
+            rows[whole(entry["image_id"])].append((x, y, whole(entry["category_id"], 2**15) - 1, *sizes))
     names = ("x", "y", "patch_id", "radius_major", "radius_minor", "axis_angle", "visible")
     for n, image_id in enumerate(ids):
         got = truth.keypoints[truth.offsets[n] : truth.offsets[n + 1]][list(names)].tolist()
         if got != expected[image_id]:
             return f"keypoints differ: image {image_id}, {got} of {expected[image_id]}"[:300]
+        if found.ignored(n)[list(names)].tolist() != crowds[image_id]:
+            return f"ignored patches differ: image {image_id}"
     for n, image in enumerate(content["images"]):
         if str(truth.condition[n]) != image.get("condition", ""):
             return f"condition differs: {str(truth.condition[n])!r} of {image.get('condition', '')!r}"[:200]
