@@ -30,7 +30,7 @@ class Hard:
     series : str
         Folder of the series.
     easy : Observed
-        The easy photograph with the smallest residuals.
+        The first easy photograph of the series.
     row : int
         Its row in the bundle.
     drift_px : float
@@ -97,8 +97,7 @@ def find_hard_photos(
         easy = [o for o in inside if not o.reason and len(o.points) >= max(LEAST_CORNERS, EASY_SHARE * most)]
         if len(easy) < 2:
             raise DataError(f"{place}: {len(easy)} photographs show enough marks, expected one before and one after")
-        rms_px = bundle.rms_px()
-        best = min(easy, key=lambda o: float(rms_px[row_of[o.photo.name]]))
+        best = easy[0]
         drift_px = 0.0
         for o in easy:
             rows = row_of[best.photo.name], row_of[o.photo.name]
