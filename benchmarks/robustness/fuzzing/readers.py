@@ -18,6 +18,7 @@ import kpbench
 import kpbench.predictions
 import kpbench.synth
 import kpbench.training
+from kpbench.boards import read_poses
 from kpbench.camera import load_camera_preset
 
 from . import binary_references, reading, references, seeds
@@ -114,6 +115,19 @@ ALL_READERS = (
     Reader(
         "coco-results", "input.json", seeds.coco_results, of_json("image_id", "category_id", "score"),
         kpbench.read_predictions, json.loads, references.predictions_json, share=1.5,
+    ),
+    Reader(
+        "poses-jsonl", "input.jsonl", lambda: seeds.poses(".jsonl"), change_jsonl,
+        read_poses, reading.is_jsonl, references.poses,
+    ),
+    Reader(
+        "poses-csv", "input.csv", lambda: seeds.poses(".csv"), lambda rng, data: mutate_csv(rng, data.decode()),
+        read_poses, reading.is_poses_csv,
+    ),
+    Reader(
+        "marked-board", "input.json", seeds.marked_boards,
+        of_json("references", "corners_mm", "dictionary", "id", "x_mm", "print_scale"),
+        lambda path: kpbench.load_board(path).references, json.loads,
     ),
     Reader(
         "manifest", "dataset.json", seeds.manifests,
