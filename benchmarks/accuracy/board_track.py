@@ -69,8 +69,8 @@ class Tally:
             return " / ".join(f"{v:.3g}" for v in np.percentile(values, (50, 95))) if values else ""
 
         nees = f"{np.mean(self.nees):.2f} ({np.median(self.nees):.2f})" if self.nees else ""
-        cells = [self.frames, len(self.mm), self.ambiguous, self.wrong, pair(self.mm), f"{np.median(self.ray_mm or [0]):.2g}"]
-        cells += [pair(self.deg), nees]
+        cells = [self.frames, len(self.mm), self.ambiguous, self.wrong, pair(self.mm)]
+        cells += [f"{np.median(self.ray_mm or [0]):.2g}", pair(self.deg), nees]
         return f"| {name} | " + " | ".join(map(str, [*cells, pair(self.ms)])) + " |"
 
 
