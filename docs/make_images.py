@@ -1,4 +1,4 @@
-"""Make the pictures of README.md and docs/tutorial.md: docs/images/*.png, of designs and simulated images alone.
+"""Make the pictures of README.md and docs: docs/images/*.png, of designs and simulated images alone.
 
     python docs/make_images.py
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import io
 import os
+import sys
 import tempfile
 from pathlib import Path
 
@@ -21,6 +22,9 @@ import kpbench
 from kpbench.cli import main as command_line
 
 IMAGES = Path(__file__).parent / "images"
+TESTS = Path(__file__).parents[1] / "tests"
+ORIENTATION = 274
+"""EXIF tag of how a photograph is turned."""
 PATCH_PX, MARGIN_PX, LABEL_PX = 160, 24, 36
 SAMPLES = 8
 """Samples per pixel and axis of the drawn patches."""
@@ -66,6 +70,32 @@ def save(name: str, source: Image.Image | str) -> None:
     Image.fromarray(few).quantize(256, dither=Image.Dither.NONE).save(IMAGES / f"{name}.png", optimize=True)
 
 
+def photograph_truth_board() -> None:
+    """Write simulated photographs of the truth board, JPEG with EXIF, into the folder ``photos``."""
+    sys.path.insert(0, str(TESTS))
+    import board_photos
+
+    Path("photos").mkdir()
+    for n in range(4):
+        exif = Image.Exif()
+        exif[ORIENTATION] = 6 if n == 1 else 1
+        pixels, _ = board_photos.photograph(n)
+        Image.fromarray(pixels).save(f"photos/IMG_{n:04d}.jpg", quality=92, exif=exif)
+
+
+def draw_labels() -> None:
+    """Write the pictures of docs/howto/photographs-and-tables.md."""
+    photograph_truth_board()
+    kpbench_command("kpbench render-patches --board truth --png --dpi 60")
+    save("truth-board", ImageOps.expand(Image.open("patches-print/truth.png"), border=1, fill=160))
+    kpbench_command("kpbench label photos --board patches-print/truth.json --out labelled --simulated")
+    kpbench_command("kpbench preview labelled --count 4 --columns 2 --tile-width 480 --out labelled.png")
+    save("labelled", "labelled.png")
+    kpbench_command("kpbench degrade labelled --suite paper-v1 --out degraded")
+    kpbench_command("kpbench preview degraded --count 8 --columns 4 --tile-width 240 --out degraded.png")
+    save("degraded", "degraded.png")
+
+
 def main() -> None:
     """Write every picture."""
     IMAGES.mkdir(exist_ok=True)
@@ -87,6 +117,7 @@ def main() -> None:
         kpbench_command("kpbench suite paper-v1 --images 1 --size 640x480 --out suite")
         kpbench_command("kpbench preview suite --tile-width 160 --out rungs.png")
         save("rungs", "rungs.png")
+        draw_labels()
     for path in sorted(IMAGES.glob("*.png")):
         print(f"{os.path.relpath(path)}: {path.stat().st_size / 1000:.0f} kB")
 

@@ -47,7 +47,17 @@ LABELLED_KEYPOINT_DTYPE = np.dtype(
         ("rho", "<f4"),  # correlation of the errors of x and y
     ]
 )
-"""Record type of one keypoint of a labelled photograph, whose truth has an error."""
+"""Record type of one keypoint of a labelled photograph, whose truth has an error.
+
+A row whose ``sigma_x`` is infinite is *ignored*: a patch is there that nobody judges, such as a covered one.
+"""
+
+
+def is_ignored(keypoints: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which rows of a table of keypoints are ignored, see :data:`LABELLED_KEYPOINT_DTYPE`."""
+    if "sigma_x" not in (keypoints.dtype.names or ()):
+        return np.zeros(len(keypoints), bool)
+    return np.asarray(np.isposinf(keypoints["sigma_x"]))
 
 
 @dataclass(frozen=True)
@@ -154,6 +164,10 @@ class Truth:
         SHA-256 of the dataset's config without the software that made the pixels; "" for none.
     file : tuple of N str, or None
         Name of each image's file; "" for none. The datasets of :func:`kpbench.generate` have no such names.
+    ignored : ndarray of shape (M,), KEYPOINT_DTYPE, or None
+        Patches that are not judged: a detection near one of them counts neither way.
+    ignored_image : ndarray of shape (M,), int64, or None
+        Index of the image of each ignored patch.
 
     Examples
     --------
@@ -174,6 +188,8 @@ class Truth:
     fingerprint: str = ""
     recipe: str = ""
     file: tuple[str, ...] | None = None
+    ignored: NDArray[Any] | None = None
+    ignored_image: NDArray[np.int64] | None = None
 
     def __len__(self) -> int:
         return len(self.image_id)

@@ -1,4 +1,4 @@
-"""Boards and their poses in the scenes of paper-v1: right points, poses without a flag, errors, NEES, time. Simulated.
+"""Boards and their poses in the scenes of a suite: right points, poses without a flag, errors, NEES, time. Simulated.
 
 The hexagon boards of the suite are shown, and a hexagon with mixed designs. Besides all detections of an image, random
 parts of them are taken: three, four and five right points, with all false alarms. Points are right if each lies within
@@ -138,17 +138,18 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=4)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--size")
+    parser.add_argument("--suite", default="paper-v1", help="also extended-v1 and camera-v1")
     parser.add_argument("--detector", default="superpoint-small")
     options = parser.parse_args()
     use_threads(1)
     cv2.setNumThreads(1)
     size = None if options.size is None else tuple(map(int, options.size.split("x")))
-    suite = BoardSuite(load_suite("paper-v1"), options.scenes, options.seed, size, backgrounds=options.backgrounds)
+    suite = BoardSuite(load_suite(options.suite), options.scenes, options.seed, size, backgrounds=options.backgrounds)
     found = detect(suite, options.predictions, options.detector).detections()
     tables: dict[str, dict[str, Tally]] = {name: defaultdict(Tally) for name in ("points", "rungs", "part")}
     for n, detections in enumerate(found):
         view, rng = suite.view(n), np.random.default_rng(n)
-        board, camera = view.board, suite.camera
+        board, camera = view.board, view.camera
         truth = BoardPose(view.pose.R_board2camera, view.pose.t_camera, np.eye(6), 0.0, 6)
         true = true_points(detections, view.keypoints)
         right = np.unique(true[true >= 0])

@@ -36,6 +36,8 @@ POSE_COLUMNS = (
     *(f"filtered_{name}" for name in (*MOTION_COLUMNS, *COVARIANCE_COLUMNS)),
 )
 """Columns of a CSV file. A covariance is symmetric: its upper triangle is listed."""
+ROTATION_TOLERANCE = 1e-4
+"""Largest deviation of a rotation times its transpose from the identity."""
 
 
 def require_poses_path(path: str | Path) -> Path:
@@ -122,18 +124,25 @@ def read_poses(path: str | Path) -> list[dict[str, Any]]:
     rows: Iterable[Any] = csv.DictReader(lines[1:]) if is_csv else filter(str.strip, lines[1:])
     found = list[dict[str, Any]]()
     parse: Callable[[Any], dict[str, Any]] = _parse_csv if is_csv else _parse_json
-    for n, row in enumerate(rows, start=3 if is_csv else 2):
-        try:
+    first = 3 if is_csv else 2
+    try:
+        for row in rows:
             found.append(parse(row))
-        except (ValueError, KeyError, TypeError):
-            raise PredictionsError(f"{path}: line {n}: expected a pose as kpbench writes it") from None
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, csv.Error):
+        raise PredictionsError(f"{path}: line {first + len(found)}: expected a pose as kpbench writes it") from None
     return found
 
 
 def _parse_json(line: str) -> dict[str, Any]:
     content = json.loads(line)
     filtered = content["filtered"]
-    return {"image_id": int(content["image_id"]), **_checked(content), "filtered": filtered and _checked(filtered)}
+    return {"image_id": _as_id(content["image_id"]), **_checked(content), "filtered": filtered and _checked(filtered)}
+
+
+def _as_id(value: object) -> int:
+    if type(value) is not int or not 0 <= value < 2**63:
+        raise ValueError
+    return value
 
 
 def _checked(content: dict[str, Any]) -> dict[str, Any]:
@@ -144,6 +153,8 @@ def _checked(content: dict[str, Any]) -> dict[str, Any]:
         rotation.shape != (3, 3)
         or place.shape != (3,)
         or not (np.isfinite(rotation).all() and np.isfinite(place).all())
+        or not np.abs(rotation @ rotation.T - np.eye(3)).max() < ROTATION_TOLERANCE
+        or np.linalg.det(rotation) < 0
     ):
         raise ValueError
     return {"rotation": rotation.tolist(), "translation_mm": place.tolist()}
@@ -163,7 +174,11 @@ def _parse_csv(row: dict[str, str]) -> dict[str, Any]:
         return _checked({"rotation": rotation, "translation_mm": place})
 
     filtered = motion("filtered_")
-    return {"image_id": int(row["image_id"]), **motion(""), "filtered": filtered if filtered["rotation"] else None}
+    return {
+        "image_id": _as_id(int(row["image_id"])),
+        **motion(""),
+        "filtered": filtered if filtered["rotation"] else None,
+    }
 
 
 def _to_dict(record: PoseRecord) -> dict[str, Any]:

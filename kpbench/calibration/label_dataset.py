@@ -21,6 +21,7 @@ from kpbench.calibration.observe import Observed, board_points_mm, observe_photo
 from kpbench.calibration.photos import as_grey, list_photos, read_photo
 from kpbench.calibration.shape import SHAPE_NAMES
 from kpbench.calibration.start import start_camera
+from kpbench.calibration.tripod import Hard, find_hard_photos, is_inside
 from kpbench.dataset.folder import Dataset
 from kpbench.dataset.generation import generate
 from kpbench.dataset.shard import Sample
@@ -74,6 +75,7 @@ class _LabelConfig:
     paths: tuple[Path, ...]
     keypoints: tuple[NDArray[Any], ...]
     conditions: tuple[tuple[str, float], ...]
+    scenes: tuple[str, ...]
     content: dict[str, Any]
 
     @property
@@ -97,7 +99,7 @@ class _LabelConfig:
         return {**self.content, "n": self.n, "shard_size": self.shard_size}
 
     def scene_id(self, index: int) -> int:
-        return index
+        return self.scenes.index(self.scenes[index])
 
     def make(self, index: int) -> tuple[Sample, tuple[str, ...]]:
         image = _read(self.paths[index])
@@ -106,7 +108,9 @@ class _LabelConfig:
         condition, rung = self.conditions[index]
         name = self.content["photos"][index]["name"]
         effects = [{"effect": "photograph", "file": name}]
-        return Sample(index, image, self.keypoints[index], effects, condition=condition, rung=rung), ()
+        return Sample(
+            index, image, self.keypoints[index], effects, condition=condition, rung=rung, scene_id=self.scene_id(index)
+        ), ()
 
 
 def label(
@@ -117,6 +121,7 @@ def label(
     camera: Camera | None = None,
     source: Source = "photographs",
     condition: Condition = "folders",
+    tripod: Sequence[str] = (),
     force: bool = False,
     overwrite: bool = False,
     progress: Callable[[int], None] = lambda photos: None,
@@ -140,6 +145,10 @@ def label(
         What reports say about the images. If kpbench wrote one of them, they are taken for simulated.
     condition : {"folders", "scale", "pitch"}
         Where condition and rung come from: folders, the board's share of the image, or its tilt.
+    tripod : sequence of str
+        Folders below `photos` whose photographs each show one fixed scene, in which light, focus, exposure or an
+        occluder change; "." for all. The easy photographs of such a series give truth to the hard ones: those with few
+        marks or none. Easy photographs must be taken before and after; the order is that of the files' names.
     force : bool
         Keep a dataset whose two halves do not agree. The dataset tells it.
     overwrite : bool
@@ -156,7 +165,8 @@ def label(
     DataError
         If the board has no reference marks, no photograph shows the board, or no camera explains the photographs.
     GateFailed
-        If the two halves of the photographs, solved apart, do not agree within their stated uncertainty.
+        If the two halves of the photographs, solved apart, do not agree within their stated uncertainty, or a tripod
+        moved.
 
     Examples
     --------
@@ -181,14 +191,16 @@ def label(
             KpbenchWarning,
             stacklevel=2,
         )
-    observed, kept, labels, has_colour = _label_all(observed, bundle, board, paths, progress)
+    observed, hard = find_hard_photos(observed, bundle, board_points_mm(board), board.points_mm[:, :2], tripod, text)
+    observed, kept, labels, has_colour = _label_all(observed, bundle, board, paths, hard, progress)
     if any(o.photo.is_of_kpbench for o in kept):
         source = "simulated photographs"
     factor, loo_px = _calibrate_sigma(labels)
-    keypoints = [_scaled(found.keypoints, factor) for found in labels]
+    drift_px = [hard[o.photo.name].drift_px if o.photo.name in hard else 0.0 for o in kept]
+    keypoints = [_scaled(found.keypoints, factor, drift) for found, drift in zip(labels, drift_px, strict=True)]
     sigma = np.concatenate([np.concatenate([table["sigma_x"], table["sigma_y"]]) for table in keypoints])
     error_px = float(np.sqrt((sigma**2).mean()))
-    content = _describe(board, bundle, observed, kept, labels, source, has_colour) | {
+    content = _describe(board, bundle, observed, kept, labels, hard, source, has_colour) | {
         "leave_one_out": {
             "marks_rms_px": round(loo_px, 5),
             "sigma_factor": round(factor, 4),
@@ -199,8 +211,9 @@ def label(
     }
     config = _LabelConfig(
         tuple(paths[o.photo.name] for o in kept),
-        tuple(keypoints),
-        tuple(_condition(o, condition, board, bundle, observed) for o in kept),
+        tuple(np.concatenate([table, found.ignored]) for table, found in zip(keypoints, labels, strict=True)),
+        tuple(_condition(o, found, condition, board, bundle) for o, found in zip(kept, labels, strict=True)),
+        tuple(next((f"{folder}/" for folder in tripod if is_inside(o.photo.name, folder)), o.photo.name) for o in kept),
         content,
     )
     dataset = generate(config, out, workers=1, overwrite=overwrite).dataset
@@ -236,18 +249,30 @@ def _judge_halves(halves: Halves | None, photos: int, source: str, force: bool) 
 
 
 def _label_all(
-    observed: list[Observed], bundle: Bundle, board: Board, paths: dict[str, Path], progress: Callable[[int], None]
+    observed: list[Observed],
+    bundle: Bundle,
+    board: Board,
+    paths: dict[str, Path],
+    hard: dict[str, Hard],
+    progress: Callable[[int], None],
 ) -> tuple[list[Observed], list[Observed], list[PhotoLabels], bool]:
-    """Label every photograph of a bundle. Those without a label are rejected."""
+    """Label every photograph of a bundle, and the hard ones of series. Those without a label are rejected."""
     board_mm = board_points_mm(board)
     labels, kept, done, has_colour = list[PhotoLabels](), list[Observed](), list[Observed](), False
-    at = 0
+    at, easy = 0, dict[str, UInt8]()
     for o in observed:
         progress(1)
-        if not o.reason:
+        row, at = at, at + (not o.reason)
+        series = hard.get(o.photo.name)
+        if series or not o.reason:
             image = _read(paths[o.photo.name])
-            found = label_photo(bundle, at, board, board_mm, as_grey(image))
-            at += 1
+            if series:
+                if series.series not in easy:  # one image at a time, as photographs are large
+                    easy = {series.series: as_grey(_read(paths[series.easy.photo.name]))}
+                found = label_photo(bundle, series.row, board, board_mm, as_grey(image), easy[series.series])
+                o = replace(o, reason="")
+            else:
+                found = label_photo(bundle, row, board, board_mm, as_grey(image))
             if len(found.keypoints):
                 has_colour |= image.ndim == 3
                 labels.append(found)
@@ -261,13 +286,11 @@ def _label_all(
 
 
 def _condition(
-    o: Observed, condition: Condition, board: Board, bundle: Bundle, observed: Sequence[Observed]
+    o: Observed, found: PhotoLabels, condition: Condition, board: Board, bundle: Bundle
 ) -> tuple[str, float]:
     if condition == "folders":
         return name_condition(o.photo.name)
-    solved = [other.photo.name for other in observed if other.reason in ("", "no-labels")]
-    pose = bundle.poses[solved.index(o.photo.name)]
-    return measure_condition(condition, board, bundle.camera, pose, bundle.shape)
+    return measure_condition(condition, board, bundle.camera, found.pose, bundle.shape)
 
 
 def _calibrate_sigma(labels: Sequence[PhotoLabels]) -> tuple[float, float]:
@@ -277,11 +300,11 @@ def _calibrate_sigma(labels: Sequence[PhotoLabels]) -> tuple[float, float]:
     return float(np.sqrt(np.clip(nees.mean() / 2, 0.25, 100.0))), float(np.sqrt((error**2).mean()))
 
 
-def _scaled(keypoints: NDArray[Any], factor: float) -> NDArray[Any]:
-    """Return keypoints with all standard deviations times a factor, and ``COMMON_SIGMA_PX`` added."""
+def _scaled(keypoints: NDArray[Any], factor: float, drift_px: float) -> NDArray[Any]:
+    """Return keypoints with all standard deviations times a factor, and ``COMMON_SIGMA_PX`` and a drift added."""
     table = keypoints.copy()
     for name in ("sigma_x", "sigma_y"):
-        table[name] = np.hypot(factor * keypoints[name], COMMON_SIGMA_PX)
+        table[name] = np.hypot(factor * keypoints[name], np.hypot(COMMON_SIGMA_PX, drift_px))
     table["rho"] *= factor**2 * keypoints["sigma_x"] * keypoints["sigma_y"] / (table["sigma_x"] * table["sigma_y"])
     return table
 
@@ -292,22 +315,21 @@ def _describe(
     observed: Sequence[Observed],
     kept: Sequence[Observed],
     labels: Sequence[PhotoLabels],
+    hard: dict[str, Hard],
     source: Source,
     has_colour: bool,
 ) -> dict[str, Any]:
     """Return the configuration of the dataset: what made the truth, and what was left out."""
     width, height = kept[0].photo.size_px
-    rms = dict(
-        zip((o.photo.name for o in observed if not o.reason or o.reason == "no-labels"), bundle.rms_px(), strict=True)
-    )
     photos = [
         o.photo.to_dict()
         | {
             "marks": len(o.points),
-            "rms_px": round(float(rms[o.photo.name]), 4),
+            "rms_px": round(found.rms_px, 4),
             "unlabelled": found.unlabelled,
             "rolling_px": round(found.rolling_px, 3),
         }
+        | ({"truth_of": hard[o.photo.name].easy.photo.name} if o.photo.name in hard else {})
         for o, found in zip(kept, labels, strict=True)
     ]
     return {

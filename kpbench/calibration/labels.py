@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from kpbench.calibration.bundle import Bundle
+from kpbench.calibration.bundle import Bundle, PhotoPose
 from kpbench.calibration.field import LeaveOneOut, ResidualField, fit_field
 from kpbench.calibration.projection import project_points
-from kpbench.calibration.visibility import look_at_patch
+from kpbench.calibration.visibility import compare_scene, look_at_patch
 from kpbench.geometry.homography import project
 from kpbench.patches.board import Board, BoardKeypoint
 from kpbench.portable import cos_sin
@@ -31,6 +31,8 @@ class PhotoLabels:
     Attributes
     ----------
     keypoints : ndarray of shape (n,), LABELLED_KEYPOINT_DTYPE
+    ignored : ndarray of shape (m,), LABELLED_KEYPOINT_DTYPE
+        Patches inside of the image that have no label, so that nobody judges a detection there.
     unlabelled : dict of str to int
         Number of keypoints without label, by reason: ``outside`` of the image, outside of the ``hull`` of the marks
         that were found, ``covered``.
@@ -38,15 +40,23 @@ class PhotoLabels:
         The check of every mark.
     rolling_px : float
         Motion of the board from the first to the last row of the image, px, that the residuals tell; 0 if they do not.
+    pose : PhotoPose
+    rms_px : float
+        Root mean square residual of the marks per coordinate, px.
     """
 
     keypoints: NDArray[Any]
+    ignored: NDArray[Any]
     unlabelled: dict[str, int]
     leave_one_out: LeaveOneOut
     rolling_px: float
+    pose: PhotoPose
+    rms_px: float
 
 
-def label_photo(bundle: Bundle, n: int, board: Board, board_mm: Float, image: UInt8) -> PhotoLabels:
+def label_photo(
+    bundle: Bundle, n: int, board: Board, board_mm: Float, image: UInt8, easy: UInt8 | None = None
+) -> PhotoLabels:
     """Return the true keypoints of photograph ``n`` of a bundle.
 
     Parameters
@@ -58,6 +68,8 @@ def label_photo(bundle: Bundle, n: int, board: Board, board_mm: Float, image: UI
         The X-corners of its marks.
     image : ndarray of shape (H, W)
         The grey photograph, which tells what is covered.
+    easy : ndarray of shape (H, W), optional
+        Photograph ``n``, if `image` is a hard photograph of the same scene.
     """
     field, leave_one_out, rolling_px = _fit(bundle, n, board_mm)
     hull = cv2.convexHull(field.points_mm.astype(np.float32))
@@ -67,27 +79,34 @@ def label_photo(bundle: Bundle, n: int, board: Board, board_mm: Float, image: UI
     found = field.predict(centres, base.by_pose)
     xy = base.xy + found.mean
     table, unlabelled = np.zeros(len(centres), LABELLED_KEYPOINT_DTYPE), Counter[str]()
-    keep = list[int]()
+    maps = np.stack([_first_order_map(bundle, n, *row) for row in zip(board.keypoints, found.mean, strict=True)])
+    is_alike = np.zeros(len(centres), bool) if easy is None else compare_scene(image, easy, maps)
+    is_judged = np.zeros(len(centres), bool)
     for k, keypoint in enumerate(board.keypoints):
         x, y = xy[k].tolist()
         if not (-0.5 <= x < image.shape[1] - 0.5 and -0.5 <= y < image.shape[0] - 0.5):
             unlabelled["outside"] += 1
             continue
+        sight = look_at_patch(image, maps[k], keypoint.patch)
+        truth = (x, y, keypoint.patch_id, *_ellipse(bundle, n, keypoint), maps[k], sight.inside, sight.contrast)
+        table[k] = (*truth, np.inf, np.inf, 0.0)  # ignored
         if cv2.pointPolygonTest(hull, (float(centres[k, 0]), float(centres[k, 1])), False) < 0:
             unlabelled["hull"] += 1
-            continue
-        H = _first_order_map(bundle, n, keypoint, found.mean[k])
-        sight = look_at_patch(image, H, keypoint.patch)
-        if not sight.is_seen:
+        elif not (sight.is_seen if easy is None else is_alike[k] and _is_seen(easy, maps[k], keypoint)):
             unlabelled["covered"] += 1
-            continue
-        (xx, xy_), (_, yy) = found.covariance[k]
-        sigma_x, sigma_y = np.sqrt([xx, yy])
-        ellipse = _ellipse(bundle, n, keypoint)
-        truth = (x, y, keypoint.patch_id, *ellipse, H, sight.inside, sight.contrast)
-        table[k] = (*truth, sigma_x, sigma_y, xy_ / (sigma_x * sigma_y))
-        keep.append(k)
-    return PhotoLabels(table[keep], dict(unlabelled), leave_one_out, rolling_px)
+        else:
+            (xx, xy_), (_, yy) = found.covariance[k]
+            sigma_x, sigma_y = np.sqrt([xx, yy])
+            table[k] = (*truth, sigma_x, sigma_y, xy_ / (sigma_x * sigma_y))
+            is_judged[k] = True
+    is_there = table["radius_major"] > 0
+    parts = table[is_judged], table[is_there & ~is_judged]
+    rms_px = float(bundle.rms_px()[n])
+    return PhotoLabels(*parts, dict(unlabelled), leave_one_out, rolling_px, pose, rms_px)
+
+
+def _is_seen(image: UInt8, H_patch2image: Float, keypoint: BoardKeypoint) -> bool:
+    return look_at_patch(image, H_patch2image, keypoint.patch).is_seen
 
 
 def _fit(bundle: Bundle, n: int, board_mm: Float) -> tuple[ResidualField, LeaveOneOut, float]:

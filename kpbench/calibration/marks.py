@@ -135,7 +135,10 @@ class MarkFinder:
             return BoardPoints.none("wrong-board" if len(number) >= 4 else "no-marks")
         number, found_px, board_mm = number[keep], found_px[keep], board_mm[keep]
         points = self._refine(image, number, [_fit(b, f) for b, f in zip(board_mm, found_px, strict=True)])
-        return self._find_missing(image, points) if len(points) >= NEIGHBOURS else points
+        before = 0
+        while NEIGHBOURS <= len(points) > before:  # each time, the marks around those that were found
+            before, points = len(points), self._find_missing(image, points)
+        return points
 
     def _refine(self, image: UInt8, number: Int, H_board2image: list[Float]) -> BoardPoints:
         """Refine the corners of marks, from a homography near each mark."""

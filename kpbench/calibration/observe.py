@@ -28,6 +28,7 @@ REJECTIONS = {
     "no-pose": "no pose fits the points",
     "does-not-fit": "the residuals are much larger than in other photographs",
     "outliers": "too many points do not fit",
+    "not-between": "no easy photograph of its series was taken before it, or none after it",
     "no-labels": "no patch lies among the marks that were found, or all are covered",
 }
 """Reason codes of rejected photographs, and what they mean."""

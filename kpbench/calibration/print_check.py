@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from kpbench.calibration.camera_solution import Calibration, calibrate
+from kpbench.calibration.ink import measure_ink_gain
+from kpbench.calibration.photos import as_grey, list_photos, read_photo
 from kpbench.calibration.shape import PrintShape
-from kpbench.errors import DesignError
+from kpbench.errors import DesignError, KpbenchWarning
 from kpbench.files import load_json, read_text
 from kpbench.patches.board_file import load_board
 from kpbench.printing.sidecar import correct_sidecar
@@ -34,8 +37,8 @@ class PrintCheck:
     ----------
     shape : PrintShape
     values : dict of str to (float, float, str)
-        Value, standard deviation and unit of: ``x to y`` (ratio of the scales), ``skew``, and ``bow`` (the largest
-        sagitta over the longer side of the board).
+        Value, standard deviation and unit of: ``x to y`` (ratio of the scales), ``skew``, ``bow`` (the largest
+        sagitta over the longer side of the board), and for a board with marks ``ink gain`` (how far black ink spreads).
     photos : int
         Number of photographs that were used.
     ruler_mm : (float, float)
@@ -82,7 +85,16 @@ def check_print(
     content = _read_sidecar(sidecar)
     calibration = calibrate(photos, load_board(sidecar), progress=progress)
     x, y = TomlTable(content, content.keys(), DesignError).numbers("ruler_mm", 0, count=2)
-    return PrintCheck(calibration.bundle.shape, _measure(calibration), len(calibration.used), (x, y))
+    values = _measure(calibration)
+    if calibration.board.references:
+        paths = dict(list_photos(photos))
+        images = (read_photo(o.photo.name, paths[o.photo.name])[1] for o in calibration.used)
+        grey = (as_grey(image) for image in images if image is not None)
+        if found := measure_ink_gain(grey, calibration.bundle, calibration.board):
+            values["ink gain"] = (*found, " mm")
+        else:
+            warnings.warn(f"{photos}: no ink gain, too few marks are sharp; come nearer", KpbenchWarning, stacklevel=2)
+    return PrintCheck(calibration.bundle.shape, values, len(calibration.used), (x, y))
 
 
 def describe_contradiction(check: PrintCheck, ruler_mm: tuple[float, float]) -> str:

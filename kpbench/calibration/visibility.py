@@ -27,6 +27,14 @@ MOST_WRONG = 0.12
 """Largest fraction of covered samples of a patch that is seen."""
 
 
+SCENE_EXTENT = 1.0
+"""Largest coordinate of the samples that are compared with another photograph, in disc radii."""
+SCENE_BLURS = ((0.0, 0.15), (0.0, 0.3), (0.0, 0.6), (0.0, 1.0), (0.15, 0.15), (0.3, 0.3), (0.3, 0.6))
+"""Standard deviations of the blur of a hard photograph and of an easy one, in disc radii."""
+LEAST_SCENE_LIKENESS = 0.7
+"""Least correlation of a hard photograph with an easy one at a patch."""
+
+
 class Sight(NamedTuple):
     """How a patch is seen."""
 
@@ -59,15 +67,13 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
     height, width = image.shape
     xy = project(H_patch2image, uv.reshape(-1, 2)).astype(np.float32).reshape(DISC_GRID, DISC_GRID, 2)
     inside = np.asarray(((xy >= -0.5) & (xy < np.array([width, height]) - 0.5)).all(axis=2), np.bool_)
-    seen = cv2.remap(
-        np.asarray(image, np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    seen = _sample(image, xy)
     use = disc & inside
     if use.sum() < 20:
         return Sight(False, 0.0, float(inside[disc].mean()))
     best, contrast, wrong = -1.0, 0.0, 1.0
     for blur, expected in zip(DISC_BLURS, ideal, strict=True):
-        smooth = _blur(np.asarray(seen, np.float64), blur)[use]
+        smooth = _blur(seen, blur)[use]
         centred, wanted = smooth - smooth.mean(), expected[use] - expected[use].mean()
         power = float(wanted @ wanted)
         slope = float(centred @ wanted) / power
@@ -78,6 +84,42 @@ def look_at_patch(image: UInt8, H_patch2image: Float, patch: Patch) -> Sight:
             wrong = float((off > WRONG * max(slope, 1e-6)).mean())
     is_seen = best >= LEAST_PATCH_LIKENESS and wrong <= MOST_WRONG
     return Sight(is_seen, contrast, float(inside[disc].mean()))
+
+
+def compare_scene(image: UInt8, easy: UInt8, H_patch2image: Float) -> NDArray[np.bool_]:
+    """Return at which patches a photograph looks as an easy photograph of the same scene, blurred and dimmed.
+
+    All patches are compared under one blur: the one that makes most of them alike.
+
+    Parameters
+    ----------
+    image, easy : ndarray of shape (H, W)
+    H_patch2image : ndarray of shape (n, 3, 3)
+
+    Returns
+    -------
+    ndarray of shape (n,), bool
+    """
+    axis = np.linspace(-SCENE_EXTENT, SCENE_EXTENT, DISC_GRID)
+    uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    likeness = np.zeros((len(H_patch2image), len(SCENE_BLURS)))
+    for n, H in enumerate(H_patch2image):
+        xy = project(H, uv).astype(np.float32).reshape(DISC_GRID, DISC_GRID, 2)
+        parts = [_sample(i, xy) for i in (image, easy)]
+        for k, blurs in enumerate(SCENE_BLURS):
+            scaled = (EXTENT / SCENE_EXTENT * blur for blur in blurs)
+            a, b = (_blur(part, blur) if blur else part for part, blur in zip(parts, scaled, strict=True))
+            a, b = a - a.mean(), b - b.mean()
+            likeness[n, k] = (a * b).sum() / np.sqrt(max(float((a * a).sum() * (b * b).sum()), 1e-12))
+    best = int(np.median(likeness, axis=0).argmax()) if len(likeness) else 0
+    return np.asarray(likeness[:, best] >= LEAST_SCENE_LIKENESS)
+
+
+def _sample(image: UInt8, xy: NDArray[np.float32]) -> Float:
+    seen = cv2.remap(
+        np.asarray(image, np.float32), xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(seen, np.float64)
 
 
 @lru_cache(maxsize=64)

@@ -41,10 +41,11 @@ def compare(
     """
     from kpbench.evaluate import compare_files
     from kpbench.report.summary import summarise_comparisons
-    from kpbench.scoring.comparison import check_no_worse, check_regression
+    from kpbench.scoring.comparison import check_no_worse, check_regression, require_margins
 
     if len(files) < 2:
         raise click.UsageError("expected two or more predictions files")
+    require_margins(dict(no_worse))
     compared = compare_files(files, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
     echo(f"dataset {compared.dataset.path}, fingerprint {compared.dataset.fingerprint[:16]}")
     echo()

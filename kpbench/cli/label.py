@@ -27,6 +27,13 @@ from kpbench.cli.messages import echo, print_warning
     show_default=True,
     help="Condition and rung: from folders such as blur/7, or from the board's share of the image or its tilt.",
 )
+@click.option(
+    "--tripod",
+    multiple=True,
+    metavar="FOLDER",
+    help="Folder below PHOTOS with photographs of one fixed scene ('.' for all): the easy ones give truth to the hard "
+    "ones; repeatable.",
+)
 @click.option("--force", is_flag=True, help="Keep a dataset whose two halves do not agree.")
 @click.option("--overwrite", is_flag=True, help="Delete the dataset in the folder first.")
 def label(
@@ -36,6 +43,7 @@ def label(
     out: Path,
     simulated: bool,
     condition: Literal["folders", "scale", "pitch"],
+    tripod: tuple[str, ...],
     force: bool,
     overwrite: bool,
 ) -> None:
@@ -48,6 +56,7 @@ def label(
     Examples:
       kpbench label photos/ --board patches-print/truth.json --out labelled
       kpbench label photos/ --board patches-print/truth.json --camera camera.yaml --out labelled
+      kpbench label photos/ --board patches-print/truth.json --tripod desk --out labelled
     """
     from kpbench.calibration.camera_solution import FEW_PHOTOS
     from kpbench.calibration.label_dataset import label as make_labels
@@ -70,6 +79,7 @@ def label(
             camera=None if camera is None else read_camera(camera),
             source="simulated photographs" if simulated else "photographs",
             condition=condition,
+            tripod=tripod,
             force=force,
             overwrite=overwrite,
             progress=progress,
@@ -91,6 +101,8 @@ def label(
     keypoints = len(result.dataset.truth.keypoints)
     echo(f"{out}: {keypoints} keypoints in {len(result.dataset)} of {len(result.observed)} {config['source']}")
     echo(f"not labelled: {unlabelled or 'none'}")
+    if (ignored := result.dataset.truth.ignored) is not None:
+        echo(f"{len(ignored)} of these lie in the images, and scores ignore detections there")
     echo(
         f"error of the truth: {result.error_px:.4f} px a coordinate, by leaving out each mark "
         f"(marks: {result.leave_one_out_px:.4f} px)"

@@ -22,7 +22,7 @@ from kpbench.cli.options import Two
     help="Lengths of the two rulers, measured on the paper. They give the absolute scale, which photographs do not.",
 )
 def print_check(photos: tuple[Path, ...], board: Path, ruler_mm: tuple[float, float] | None) -> None:
-    """Measure a print in photographs: ratio of its scales, skew, and bow.
+    """Measure a print in photographs: ratio of its scales, skew, bow, and ink gain.
 
     The command writes NAME.measured.json beside the sidecar, with lengths corrected to the real print. Without
     --ruler-mm, the print is taken to have the right size on average, and photographs tell the ratio.

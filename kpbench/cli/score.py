@@ -47,6 +47,8 @@ def report_suffixes() -> Iterable[str]:
 
 
 FILE = click.Path(dir_okay=False, path_type=Path)
+OPTIONS_OF_POSES = ("preds", "truth", "json_file", "least", "most")
+"""Parameters of ``kpbench score`` that a file of poses has a use for."""
 
 
 def scoring_options(command: Callable[..., None]) -> Callable[..., None]:
@@ -129,7 +131,8 @@ def score(
     from kpbench.scoring.scores import check_gates
 
     if holds_poses(preds):
-        _score_poses(preds, dict(least), dict(most), **arguments)
+        _refuse_options_of_predictions(preds)
+        _score_poses(preds, dict(least), dict(most), arguments["truth"], arguments["json_file"])
         return
     scored = score_file(preds, command=["kpbench", *sys.argv[1:]], warn=print_warning, **arguments)
     scores, dataset = scored.scores, scored.dataset
@@ -140,10 +143,20 @@ def score(
     check_gates(scores, dict(least), dict(most))
 
 
+def _refuse_options_of_predictions(poses: Path) -> None:
+    """Refuse options that a file of poses has no use for."""
+    context = click.get_current_context()
+    for option in context.command.params:
+        is_given = context.get_parameter_source(option.name or "") is click.core.ParameterSource.COMMANDLINE
+        if is_given and option.name not in OPTIONS_OF_POSES:
+            shown = ", ".join(f"--{n}" for n in ("gt", "json", "min", "max"))
+            raise click.UsageError(f"{poses} holds poses; {option.opts[0]} is for detections, expected only {shown}.")
+
+
 def _score_poses(
-    poses: Path, least: dict[str, float], most: dict[str, float], truth: Path | None, json_file: Path | None, **_: Any
+    poses: Path, least: dict[str, float], most: dict[str, float], truth: Path | None, json_file: Path | None
 ) -> None:
-    """Score a file of poses; the options that are for predictions alone are of no effect."""
+    """Score a file of poses."""
     from kpbench.scoring.scores import check_gates
     from kpbench.tracking.scores import score_poses, summarise_tracks
     from kpbench.writing import require_writable, write_file

@@ -72,7 +72,8 @@ class Histogram:
 def patch_names(dataset: Dataset | CocoDataset) -> dict[int, str]:
     """Return the name of every patch ID. An ID without a name in the dataset's config gets the name ``patch-ID``."""
     known = {patch["id"]: patch["name"] for patch in dataset.config.get("patches", [])}
-    ids = sorted({*known, *dataset.truth.keypoints["patch_id"]})
+    truth = dataset.truth
+    ids = sorted({*known, *truth.keypoints["patch_id"], *(() if truth.ignored is None else truth.ignored["patch_id"])})
     return {int(patch_id): known.get(int(patch_id), f"patch-{patch_id}") for patch_id in ids}
 
 
@@ -86,7 +87,8 @@ def dataset_facts(dataset: Dataset | CocoDataset) -> dict[str, str]:
     >>> dataset_facts(open_dataset("kpbench-data"))["images"]
     '6 of 640x480, grey'
     """
-    image, config, keypoints = dataset.image(0), dataset.config, dataset.truth.keypoints
+    image, config = dataset.image(0), dataset.config
+    keypoints, ignored = dataset.truth.keypoints, dataset.truth.ignored
     sources = [f"seed {config['seed']}"] if "seed" in config else []
     if "backgrounds" in config:
         sources.append(f"{config['backgrounds'].get('kind', 'n/a')} backgrounds")
@@ -108,7 +110,7 @@ def dataset_facts(dataset: Dataset | CocoDataset) -> dict[str, str]:
         **_disk_facts(dataset),
         "made from": ", ".join(sources) or "n/a",
         "designs": ", ".join(designs) or "n/a",
-        "keypoints": f"{len(keypoints)}",
+        "keypoints": f"{len(keypoints)}" + ("" if ignored is None else f", and {len(ignored)} ignored"),
     }
 
 

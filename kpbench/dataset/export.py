@@ -152,16 +152,19 @@ def _export_coco(dataset: Dataset | CocoDataset, folder: Path, progress: Progres
         height, width = image.shape[:2]
         groups = _scoring_groups(dataset, n)
         images.append({"id": int(ids[n]), "file_name": name, "width": width, "height": height, **groups})
-        for k, box in zip(keypoints, _disc_boxes(keypoints, width, height), strict=True):
+        ignored = dataset.ignored(n)
+        rows = np.concatenate([keypoints, ignored])
+        for row, (k, box) in enumerate(zip(rows, _disc_boxes(rows, width, height), strict=True)):
+            is_judged = row < len(keypoints)
             annotations.append({
                 "id": len(annotations) + 1,  # pycocotools takes id 0 for "no match"
                 "image_id": int(ids[n]),
                 "category_id": int(k["patch_id"]) + 1,
-                "keypoints": [float(k["x"]), float(k["y"]), 2],
-                "num_keypoints": 1,
+                "keypoints": [float(k["x"]), float(k["y"]), 2 if is_judged else 0],
+                "num_keypoints": int(is_judged),
                 "bbox": box.tolist(),
                 "area": float(box[2] * box[3]),
-                "iscrowd": 0,
+                "iscrowd": int(not is_judged),
                 "patch_id": int(k["patch_id"]),
                 **{c: float(k[c]) for c in ("radius_major", "radius_minor", "axis_angle", "visible")},
             })  # fmt: skip
@@ -181,7 +184,7 @@ def _export_coco(dataset: Dataset | CocoDataset, folder: Path, progress: Progres
     if source := image_source(dataset.config):
         info["source"] = source
     content = {"info": info, "licenses": [], "images": images, "annotations": annotations, "categories": categories}
-    write_file(folder / "annotations.json", json.dumps(content).encode())
+    write_file(folder / "annotations.json", json.dumps(content, allow_nan=False).encode())
     return folder / "annotations.json"
 
 
@@ -191,7 +194,8 @@ def _scoring_groups(dataset: Dataset | CocoDataset, n: int) -> dict[str, Any]:
     scene = {"scene_id": int(truth.scene_id[n])}
     if not truth.condition[n]:
         return scene
-    return {"condition": str(truth.condition[n]), "rung": float(truth.rung[n]), **scene}
+    rung = {} if np.isnan(truth.rung[n]) else {"rung": float(truth.rung[n])}
+    return {"condition": str(truth.condition[n]), **rung, **scene}
 
 
 def _export_yolo(dataset: Dataset | CocoDataset, folder: Path, progress: Progress, splits: list[str]) -> Path:

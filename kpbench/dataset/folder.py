@@ -21,7 +21,7 @@ from kpbench.errors import DataError, system_reason
 from kpbench.files import DoubleKeyError, encode_utf8, folder_at, load_json, read_bytes, sha256_of
 from kpbench.hdf5 import MOST_AHEAD
 from kpbench.text import is_name
-from kpbench.types import Truth, UInt8
+from kpbench.types import Truth, UInt8, is_ignored
 from kpbench.writing import write_file
 
 MANIFEST = "dataset.json"
@@ -89,15 +89,6 @@ def make_manifest(
 def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
     """Write ``dataset.json``, which makes the folder a finished dataset."""
     write_file(folder / MANIFEST, encode_utf8(json.dumps(content, indent=1, ensure_ascii=False) + "\n"))
-
-
-def recorded_digests(folder: Path) -> dict[str, str]:
-    """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
-    try:
-        shards = load_json(read_bytes(folder / MANIFEST, is_noted=False).decode())["shards"]
-        return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 class Dataset:
@@ -179,6 +170,15 @@ class Dataset:
 
     def keypoints(self, index: int) -> NDArray[Any]:
         """Return the true keypoints of image number ``index``, a table of :data:`kpbench.KEYPOINT_DTYPE`."""
+        rows = self._rows(index)
+        return rows[~is_ignored(rows)]
+
+    def ignored(self, index: int) -> NDArray[Any]:
+        """Return the patches of image number ``index`` that are not judged, a table as :meth:`keypoints`."""
+        rows = self._rows(index)
+        return rows[is_ignored(rows)]
+
+    def _rows(self, index: int) -> NDArray[Any]:
         file, row, path = self._locate(index)
         with shard_errors(path):
             low, high = file["offsets"][row : row + 2]
@@ -222,13 +222,13 @@ class Dataset:
         offsets, *columns = zip(*self._read_columns(("offsets", *names)), strict=True)
         counts = np.concatenate([np.diff(part) for part in offsets])
         whole: dict[str, Any] = dict(zip(names, map(np.concatenate, columns), strict=True))
-        recipe = canonical_json({key: value for key, value in self.config.items() if key != "pixels"})
-        return Truth(
-            **whole,
-            offsets=np.concatenate([[0], np.cumsum(counts)]),
-            fingerprint=self.fingerprint,
-            recipe=hashlib.sha256(encode_utf8(recipe)).hexdigest(),
-        )
+        if (left_out := is_ignored(whole["keypoints"])).any():
+            image, table = np.repeat(np.arange(len(counts)), counts), whole["keypoints"]
+            counts = np.bincount(image[~left_out], minlength=len(counts))
+            whole |= {"keypoints": table[~left_out], "ignored": table[left_out], "ignored_image": image[left_out]}
+        recipe = encode_utf8(canonical_json({key: value for key, value in self.config.items() if key != "pixels"}))
+        whole |= {"fingerprint": self.fingerprint, "recipe": hashlib.sha256(recipe).hexdigest()}
+        return Truth(**whole, offsets=np.concatenate([[0], np.cumsum(counts)]))
 
     def verify(self) -> Iterator[ShardEntry]:
         """Check every field of the manifest and every byte of the shards. Yield each shard after its check.
@@ -359,8 +359,7 @@ def _read_manifest(folder: Path) -> Dataset:
     except DoubleKeyError as error:
         raise DataError(f"{manifest}: {error}") from None
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError):
-        expected = "JSON with schema, config, fingerprint and shards"
-        raise DataError(f"{manifest}: not a dataset manifest, expected {expected}") from None
+        raise DataError(f"{manifest}: not a dataset manifest, expected schema, config, fingerprint, shards") from None
     if fault:
         raise DataError(f"{manifest}: {fault}")
     return Dataset(folder, content)

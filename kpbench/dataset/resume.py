@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from kpbench.dataset.card import CARD_FILES
-from kpbench.dataset.folder import MANIFEST, ShardEntry, recorded_digests
+from kpbench.dataset.folder import MANIFEST, ShardEntry
 from kpbench.dataset.shard import canonical_json, open_shard
 from kpbench.errors import DataError
-from kpbench.files import load_json, sha256_of
+from kpbench.files import load_json, read_bytes, sha256_of
 from kpbench.writing import is_replaceable, remove_file, remove_leftovers, require_removable, require_writable
 
 MOST_SHARDS = 4_000_000
@@ -22,6 +22,15 @@ LONGEST_VALUE = 40
 """An error message shows two different values of a key only if each value has fewer characters than this."""
 REMEDY = "; pass `overwrite=True` to replace it, or another `out`"
 """What a user can do about a folder that holds another dataset."""
+
+
+def recorded_digests(folder: Path) -> dict[str, str]:
+    """Return each shard's SHA-256 from the manifest, by file name. Return {} if the manifest cannot be read."""
+    try:
+        shards = load_json(read_bytes(folder / MANIFEST, is_noted=False).decode())["shards"]
+        return {str(shard["file"]): str(shard["sha256"]) for shard in shards}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from kpbench.predictions.coco_fields import (
     CocoResult,
     Columns,
     find_outside,
+    has_place,
     make_columns,
     require_possible_images,
     require_possible_keypoints,
@@ -88,6 +89,12 @@ class CocoDataset:
         first, last = self.truth.offsets[index : index + 2]
         return self.truth.keypoints[first:last]
 
+    def ignored(self, index: int) -> NDArray[Any]:
+        """Return the patches of an image that are not judged, a table as :meth:`keypoints`."""
+        if self.truth.ignored is None:
+            return self.truth.keypoints[:0]
+        return np.asarray(self.truth.ignored[self.truth.ignored_image == index])
+
     def effects(self, index: int) -> list[dict[str, Any]]:
         """Return an empty list: annotations do not tell what degraded an image."""
         return []
@@ -116,7 +123,8 @@ def open_coco(path: str | Path) -> CocoDataset:
     """Read true keypoints from a COCO annotations file.
 
     Each annotation has one keypoint ``[x, y, v]`` and its radius in px: ``radius``, or ``radius_major`` and
-    ``radius_minor``. Annotations with v = 0 are skipped. The patch ID is ``category_id`` minus 1, as
+    ``radius_minor``. Annotations with v = 0 are skipped. Those with ``iscrowd`` 1 and a radius are ignored
+    (:attr:`kpbench.Truth.ignored`), also with v = 0. The patch ID is ``category_id`` minus 1, as
     :func:`kpbench.export_dataset` numbers the categories. Images may have a ``condition`` (text), a ``rung`` (number)
     and a ``scene_id`` (whole number).
 
@@ -262,14 +270,17 @@ def _make_truth(images: Columns, annotations: Columns, fingerprint: str) -> Trut
         raise DataError("two images share an id")
     require_possible_images(images)
     image_id = annotations["image_id"]
-    keypoints, labelled = _make_keypoints(annotations)
+    keypoints, is_placed = _make_keypoints(annotations)
+    is_crowd = is_placed & (annotations["iscrowd"] == 1)
+    labelled = is_placed & ~is_crowd
     place = np.searchsorted(ids, image_id, sorter=sorter)
     unknown = np.append(ids[sorter], -1)[place] != image_id
     if unknown.any():
         n = int(np.argmax(unknown))
         raise DataError(f"annotations[{n}]: image_id is {image_id[n]}, but there is no such image")
-    image = sorter[place[labelled]]
+    image, crowd_image = sorter[place[labelled]], sorter[place[is_crowd]]
     rows = np.flatnonzero(labelled)[np.argsort(image, kind="stable")]
+    crowd_order = np.argsort(crowd_image, kind="stable")
     is_in_order = np.array_equal(rows, np.arange(len(keypoints)))
     return Truth(
         image_id=ids,
@@ -280,11 +291,13 @@ def _make_truth(images: Columns, annotations: Columns, fingerprint: str) -> Trut
         scene_id=np.where(images["scene_id"] < 0, ids, images["scene_id"]),
         fingerprint=fingerprint,
         file=tuple(images["file_name"].tolist()) if any(images["file_name"]) else None,
+        ignored=keypoints[is_crowd][crowd_order] if is_crowd.any() else None,
+        ignored_image=crowd_image[crowd_order] if is_crowd.any() else None,
     )
 
 
 def _make_keypoints(annotations: Columns) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """Return the keypoints of all annotations, of type KEYPOINT_DTYPE, and whether each is labelled (v over 0)."""
+    """Return the keypoints of all annotations, of type KEYPOINT_DTYPE, and whether each has a place."""
     points = annotations["keypoints"]
     table = np.zeros(len(points), KEYPOINT_DTYPE)
     table["x"], table["y"] = points[:, 0], points[:, 1]
@@ -297,7 +310,7 @@ def _make_keypoints(annotations: Columns) -> tuple[NDArray[Any], NDArray[np.bool
         table["radius_major"] = np.where(np.isnan(major), radius, major)
         table["radius_minor"] = np.where(np.isnan(minor), table["radius_major"], minor)
     require_possible_keypoints(annotations, table)
-    return table, points[:, 2] > 0
+    return table, has_place(annotations, table)
 
 
 def decode_coco_results(data: bytes) -> Predictions:

@@ -53,6 +53,7 @@ class CocoAnnotation(msgspec.Struct, gc=False):
     radius_minor: float | None = None
     axis_angle: float | msgspec.UnsetType = msgspec.UNSET
     visible: float | msgspec.UnsetType = msgspec.UNSET
+    iscrowd: bool | int | float | None = 0
 
 
 class CocoResult(msgspec.Struct, gc=False):
@@ -72,6 +73,7 @@ EXPECTED_IN_COCO = {
     "height": "a number of px",
     "id": "a whole number of 0 or more",
     "image_id": "a whole number of 0 or more",
+    "iscrowd": "0 or 1",
     "keypoints": "one keypoint [x, y, v] of numbers",
     "radius": "a number of px",
     "radius_major": "a number of px",
@@ -105,6 +107,7 @@ ANNOTATION_COLUMNS: dict[str, tuple[type, Any]] = {
     "radius_minor": (float, np.nan),
     "axis_angle": (float, 0.0),
     "visible": (float, 1.0),
+    "iscrowd": (float, 0.0),
 }
 RESULT_COLUMNS: dict[str, tuple[type, Any]] = {
     "image_id": (int, None),
@@ -197,7 +200,7 @@ def require_possible_keypoints(annotations: Columns, table: NDArray[Any]) -> Non
             raise DataError(f"annotations[{n}] (image_id {annotations['image_id'][n]}): {text}")
 
     points = annotations["keypoints"]
-    labelled = points[:, 2] != 0
+    labelled = has_place(annotations, table)
     refuse(~np.isin(points[:, 2], (0, 1, 2)), "the visibility v of keypoints is {v:g}, expected 0, 1 or 2")
     lacks_radius = labelled & np.isnan(table["radius_major"])
     refuse(lacks_radius, "has no radius, expected radius, or radius_major and radius_minor, in px")
@@ -212,6 +215,12 @@ def require_possible_keypoints(annotations: Columns, table: NDArray[Any]) -> Non
         "keypoints are [{x}, {y}, {v}] and the radius is {radius_major}, expected " + expected,
     )
     _require_different(annotations, labelled)
+
+
+def has_place(annotations: Columns, table: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return which annotations have a keypoint: v is over 0, or it is ignored (``iscrowd``) and has a radius."""
+    is_crowd = annotations["iscrowd"] == 1
+    return np.asarray((annotations["keypoints"][:, 2] != 0) | (is_crowd & ~np.isnan(table["radius_major"])))
 
 
 def _require_different(annotations: Columns, labelled: NDArray[np.bool_]) -> None:

@@ -70,7 +70,8 @@ def draw_panels(panels: Sequence[Panel], suffix: str, *, columns: int = 3) -> by
         raise DataError(f"a figure ({suffix}) needs one more package: pip install 'kpbench[report]'") from None
     columns = min(columns, len(panels))
     rows = -(-len(panels) // columns)
-    with matplotlib.rc_context({**matplotlib.rcParamsDefault, "backend": "agg", **MATPLOTLIB_STYLE}):
+    style: dict[Any, Any] = {**matplotlib.rcParamsDefault, "backend": "agg", **MATPLOTLIB_STYLE}
+    with matplotlib.rc_context(style):
         figure = Figure((columns * PANEL_INCHES[0], rows * PANEL_INCHES[1] + 0.35), layout="constrained")
         grid = figure.subplots(rows, columns, squeeze=False).ravel()
         named: dict[str, Any] = {}

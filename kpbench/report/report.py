@@ -69,6 +69,10 @@ def _describe_images(report: Report) -> str:
         error = first.truth_error
         text += f" The truth has a standard deviation of {error['sigma_median_px']:.4f} px (median); it limits the "
         text += f"matching threshold of {error['limited']:.0f} keypoints."
+    if (ignored := first.ignored)["patches"]:
+        text += f" {ignored['patches']} more patches are ignored: "
+        text += " and ".join(f"{run.ignored['detections']} detections of {run.name}" for run in report.runs)
+        text += " at them count neither way."
     return text
 
 

@@ -43,8 +43,10 @@ def summarise_scores(scores: Scores, poses: Sequence[PoseGroup] = ()) -> str:
         f"keypoints    {n['truths']}: {n['matched']} matched ({n['wrong_id']} with a wrong ID), {n['missed']} missed",
         f"detections   {n['detections']}: {n['matched']} matched, {n['duplicate']} duplicates, "
         f"{n['near_miss']} near misses, {n['clutter']} clutter",
-        "",
     ]
+    if (ignored := scores.ignored)["patches"]:
+        lines.append(f"ignored      {ignored['patches']} patches, {ignored['detections']} detections at them")
+    lines.append("")
     for name, label in LABELS.items():
         if name not in hidden:
             estimate = Estimate(overall.metrics[name], overall.intervals.get(name))

@@ -92,6 +92,12 @@ class DetectionPoints:
     patch_id: Int | None = None
     covariance: Float | None = None
 
+    def select(self, keep: NDArray[np.bool_]) -> DetectionPoints:
+        """Return some of the detections."""
+        patch_id = None if self.patch_id is None else self.patch_id[keep]
+        covariance = None if self.covariance is None else self.covariance[keep]
+        return DetectionPoints(self.xy[keep], self.score[keep], self.image[keep], patch_id, covariance)
+
 
 @dataclass(frozen=True)
 class Matches:

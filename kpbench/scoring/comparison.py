@@ -246,6 +246,15 @@ def check_regression(comparisons: Sequence[Comparison]) -> None:
         raise GateFailed("; ".join(failed))
 
 
+def require_margins(margins: Mapping[str, float]) -> None:
+    """Raise an error if a margin of :func:`check_no_worse` is of a metric that is not compared, or not positive."""
+    for metric, margin in margins.items():
+        if metric not in COMPARED_METRICS:
+            raise DataError(f"{metric} is not compared, only {', '.join(COMPARED_METRICS)}")
+        if not margin > 0:
+            raise DataError(f"the margin of {metric} is {margin:g}, expected a positive number")
+
+
 def check_no_worse(comparisons: Sequence[Comparison], margins: Mapping[str, float]) -> None:
     """Raise an error unless the first detector is no worse than the others by more than a margin, over all images.
 
@@ -268,12 +277,9 @@ def check_no_worse(comparisons: Sequence[Comparison], margins: Mapping[str, floa
     >>> scores = kpbench.score(kpbench.open_dataset("kpbench-data"), kpbench.read_predictions("preds.json"))
     >>> kpbench.scoring.check_no_worse([kpbench.compare(scores, scores)], {"detection_score": 0.01})
     """
+    require_margins(margins)
     failed = []
     for metric, margin in margins.items():
-        if metric not in COMPARED_METRICS:
-            raise DataError(f"{metric} is not compared, only {', '.join(COMPARED_METRICS)}")
-        if not margin > 0:
-            raise DataError(f"the margin of {metric} is {margin:g}, expected a positive number")
         for c in comparisons:
             d = next(d for d in c.differences if d.condition is None and d.metric == metric)
             if not d.is_no_worse(margin):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kpbench.errors import DataError
-from kpbench.scoring.assignment import DUPLICATE, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
+from kpbench.scoring.assignment import DUPLICATE, MATCHED, NEAR_MISS, DetectionPoints, Matches, TruthPoints, match
 from kpbench.scoring.fingerprint import find_images, warn_of_ids
-from kpbench.types import Float, Int, Predictions, Truth
+from kpbench.types import Float, Int, Predictions, Truth, is_ignored
 
 TRUTH_REACH = 3.0
 """Least matching threshold, in standard deviations of the truth along its worst direction."""
@@ -90,6 +90,8 @@ class Outcomes:
     settings : Settings
     detector : dict
         The description of the detector in the predictions.
+    ignored_detections : int
+        Number of detections that are left out: without match, within the matching threshold of an ignored patch.
 
     Examples
     --------
@@ -110,6 +112,7 @@ class Outcomes:
     literally_correct: NDArray[np.bool_]
     settings: Settings
     detector: dict[str, Any]
+    ignored_detections: int = 0
 
     @property
     def matched(self) -> NDArray[np.bool_]:
@@ -207,30 +210,40 @@ def match_predictions(
     if not len(truth):
         raise DataError("the dataset has no images")
     image = find_images(truth, predictions, allow_missing)
-    points = _read_points(truth, settings.eps_radius)
+    points = _read_points(truth, truth.keypoints, np.repeat(np.arange(len(truth)), np.diff(truth.offsets)), settings)
     truth_id = truth.keypoints["patch_id"].astype(np.int64)
     # Predictions without detections hold no IDs, but the detector may know IDs: keep the ID counts defined
     ids = predictions.patch_id if len(predictions.xy) else np.zeros(0, np.int64)
     detections = DetectionPoints(predictions.xy, predictions.score, image, ids, predictions.covariance)
     matches = match(points, detections, settings.eps)
+    left_out = _find_ignored(truth, detections, matches, settings)
+    if count := int(np.count_nonzero(left_out)):  # without them, the same detections match
+        detections = detections.select(~left_out)
+        ids, matches = detections.patch_id, match(points, detections, settings.eps)
     warn_of_ids(truth, predictions, int(np.count_nonzero(matches.detection >= 0)))
-    correct, literally_correct = np.zeros(len(truth_id), bool), np.zeros(len(image), bool)
+    correct, literally_correct = np.zeros(len(truth_id), bool), np.zeros(len(detections.xy), bool)
     if ids is not None:
         t, d = np.flatnonzero(matches.detection >= 0), np.flatnonzero(matches.nearest >= 0)
         correct[t] = (ids[matches.detection[t]] == truth_id[t]) & ~matches.contradicted[t]
         literally_correct[d] = ids[d] == truth_id[matches.nearest[d]]
-    return Outcomes(
-        truth, points, truth_id, detections, matches, correct, literally_correct, settings, predictions.detector
-    )
+    about = settings, predictions.detector, count
+    return Outcomes(truth, points, truth_id, detections, matches, correct, literally_correct, *about)
 
 
-def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
-    """Check the true keypoints, and return them as columns."""
-    keypoints = truth.keypoints
+def _find_ignored(truth: Truth, found: DetectionPoints, matches: Matches, settings: Settings) -> NDArray[np.bool_]:
+    """Return which detections match no true keypoint and are within the matching threshold of an ignored patch."""
+    if truth.ignored is None or truth.ignored_image is None:
+        return np.zeros(len(found.xy), bool)
+    points = _read_points(truth, truth.ignored, truth.ignored_image, settings)
+    near = match(replace(points, least_reach_px=None), found, settings.eps).nearest >= 0
+    return np.asarray(near & (matches.kind != MATCHED))
+
+
+def _read_points(truth: Truth, keypoints: NDArray[Any], image: Int, settings: Settings) -> TruthPoints:
+    """Check keypoints, and return them as columns."""
     xy = np.stack([keypoints["x"], keypoints["y"]], axis=1).astype(np.float64)
     major, minor = keypoints["radius_major"].astype(np.float64), keypoints["radius_minor"].astype(np.float64)
-    radius = {"major": major, "minor": minor, "mean": (major + minor) / 2}[eps_radius]
-    image = np.repeat(np.arange(len(truth)), np.diff(truth.offsets))
+    radius = {"major": major, "minor": minor, "mean": (major + minor) / 2}[settings.eps_radius]
     valid = np.isfinite(xy).all(axis=1) & np.isfinite(radius) & (radius > 0)
     if not valid.all():
         row = int(np.argmin(valid))
@@ -238,8 +251,8 @@ def _read_points(truth: Truth, eps_radius: str) -> TruthPoints:
             f"image_id {truth.image_id[image[row]]}: a true keypoint at {xy[row].tolist()} has radius "
             f"{radius[row]}, expected finite numbers and a radius over 0"
         )
-    covariance = truth_covariance(keypoints)
-    if covariance is None:
+    covariance = truth_covariance(keypoints[~is_ignored(keypoints)])
+    if covariance is None or len(covariance) < len(keypoints):
         return TruthPoints(xy, radius, image)
     return TruthPoints(xy, radius, image, TRUTH_REACH * np.sqrt(np.linalg.eigvalsh(covariance)[:, 1]))
 

@@ -184,6 +184,12 @@ class Scores:
         median = float(np.median(sigma)) if len(sigma) else 0.0
         return {"sigma_median_px": median, "limited": int(self.outcomes.truth_limited.sum())}
 
+    @property
+    def ignored(self) -> dict[str, int]:
+        """Number of ignored ``patches`` in the images, and of ``detections`` at them, which count neither way."""
+        patches = self.outcomes.truth.ignored
+        return {"patches": 0 if patches is None else len(patches), "detections": self.outcomes.ignored_detections}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the content of the scores file (``kpbench.scores/1``), without provenance."""
         return {
@@ -192,6 +198,7 @@ class Scores:
                 "fingerprint": self.fingerprint or None,
                 "images": self.overall.counts["images"],
                 **({} if self.outcomes.truth_points.least_reach_px is None else {"truth": self.truth_error}),
+                **({"ignored": self.ignored} if self.ignored["patches"] else {}),
             },
             "detector": self.detector,
             "settings": asdict(self.settings),

@@ -29,7 +29,7 @@ from kpbench.seeds import SUITE_EFFECT, SUITE_FIELD, stage_rng
 from kpbench.synth.finish import discs_of, unoccluded_fraction
 from kpbench.synth.suite import describe_condition
 from kpbench.synth.suite_file import Condition, Suite
-from kpbench.types import Float, UInt8
+from kpbench.types import LABELLED_KEYPOINT_DTYPE, Float, UInt8
 
 FREE_CONDITIONS = ("", "free")
 """Conditions of images that belong to no rung."""
@@ -208,7 +208,7 @@ class DegradeConfig:
         """
         position, condition, step = self._locate(index)
         truth, scene = self.labelled.truth, self.scene_id(index)
-        image, keypoints = self._read(position), self.labelled.keypoints(position)
+        image, keypoints = self._read(position), self._keypoints(position)
         effects = self.labelled.effects(position)
         if condition is None:
             name, rung = str(truth.condition[position]), float(truth.rung[position])
@@ -233,6 +233,18 @@ class DegradeConfig:
         if self.channels == 1:
             return to_grey(image)
         return image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), np.uint8)
+
+    def _keypoints(self, position: int) -> NDArray[Any]:
+        """Return the true keypoints of a labelled image, and then its ignored ones."""
+        keypoints = self.labelled.keypoints(position)
+        if self.labelled.truth.ignored is None:
+            return keypoints
+        parts = [np.zeros(len(part), LABELLED_KEYPOINT_DTYPE) for part in (keypoints, self.labelled.ignored(position))]
+        for table, part in zip(parts, (keypoints, self.labelled.ignored(position)), strict=True):
+            for name in part.dtype.names or ():
+                table[name] = part[name]
+        parts[1]["sigma_x"] = parts[1]["sigma_y"] = np.inf
+        return np.concatenate(parts)
 
     def _update(self, image: UInt8, keypoints: NDArray[Any], effects: list[Effect]) -> NDArray[Any]:
         """Return the truth in a degraded image: no effect moves it, but ``visible`` and ``contrast`` change.

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers import kpbench as run
+from PIL import Image
 
 import kpbench
 from kpbench.calibration.bundle import PhotoPose
@@ -82,6 +83,8 @@ def test_covered_patches_and_those_outside_the_marks_are_not_labelled(photos, tm
     found = {photo["name"]: photo["unlabelled"] for photo in result.dataset.config["photos"]}
     assert found["03.png"] == {"covered": 2}
     assert sum(found["04.png"].values()) >= 4
+    ignored = result.dataset.ignored([*found].index("03.png"))
+    np.testing.assert_allclose(ignored["x"], truth["03.png"]["x"][[2, 5]], atol=0.05)
     table, true = match_truth(result.dataset, truth)
     assert np.hypot(table["x"] - true["x"], table["y"] - true["y"]).max() < 0.05
 
@@ -153,6 +156,43 @@ def test_share_of_the_image_and_tilt_are_measured():
     assert measured("scale", np.sqrt(whole / 0.225))[0] == "free"
     assert measured("pitch", 900.0, 31.0) == ("pitch", 30.0)
     assert measured("pitch", 900.0, 35.0)[0] == "free"
+
+
+def test_exif_turn_and_jpeg_quality_are_recorded_and_the_pixels_stay(photos, tmp_path):
+    (tmp_path / "photos").mkdir()
+    for n, (orientation, quality) in enumerate(((6, 92), (1, 80))):
+        image = Image.open(photos[0] / f"0{n}.png")
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        image.save(tmp_path / "photos" / f"{n}.jpg", quality=quality, exif=exif)
+    kpbench.print_boards([board_photos.BOARD], tmp_path / "print", formats=["svg"])
+    kpbench.write_camera(tmp_path / "camera.yaml", board_photos.CAMERA)
+    done = run(
+        "label", tmp_path / "photos", "--board", tmp_path / "print" / "truth.json",
+        "--camera", tmp_path / "camera.yaml", "--out", tmp_path / "set",
+    )  # fmt: skip
+    assert "1 photographs are turned by their EXIF data; the dataset holds them as the sensor saw them" in done.stderr
+    dataset = kpbench.open_dataset(tmp_path / "set")
+    assert [(p["exif_turn"], p["jpeg_quality"]) for p in dataset.config["photos"]] == [(6, 92), (1, 80)]
+    assert dataset.config["pixels_turned"] is False
+    assert dataset.image(0).shape == (720, 960)
+    table, true = match_truth(dataset, {f"{n}.jpg": photos[1][f"0{n}.png"] for n in range(2)})
+    assert np.abs(table["x"] - true["x"]).max() < 0.1
+
+
+def test_a_rolling_shutter_in_motion_is_flagged(photos, tmp_path):
+    shutil.copytree(photos[0], tmp_path / "photos")
+    image = cv2.imread(str(photos[0] / "01.png"), 0)
+    y, x = np.mgrid[:720, :960].astype(np.float32)
+    sheared = cv2.remap(image, x - 0.6 * (y / 720 - 0.5), y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    cv2.imwrite(str(tmp_path / "photos" / "01.png"), sheared)
+    with pytest.warns(KpbenchWarning, match="two halves"):
+        result = kpbench.label(tmp_path / "photos", board_photos.BOARD, tmp_path / "set", camera=board_photos.CAMERA)
+    dataset = result.dataset
+    rolling_px = {photo["name"]: photo["rolling_px"] for photo in dataset.config["photos"]}
+    assert max(rolling_px, key=rolling_px.get) == "01.png"
+    assert 0.3 < rolling_px["01.png"] < 0.9
+    assert sorted(rolling_px.values())[2] == 0, "most are still"
 
 
 def test_images_that_kpbench_wrote_never_become_photographs(photos, tmp_path):

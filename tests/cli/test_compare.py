@@ -57,6 +57,8 @@ def test_no_worse_must_be_shown(here):
     assert (first["p"], first["p_holm"]) == (2 / 2**4, None)  # 4 of 12 scenes differ
     refused = kpbench("compare", "poor.csv", "good.json", "--no-worse", "detection_score=0.01", code=1).stderr
     assert refused.startswith("kpbench: detection score of d poor.csv may be worse than that of d good.json by more")
+    refused = kpbench("compare", "no.json", "gone.json", "--no-worse", "nees=0.1", code=1).stderr
+    assert refused.startswith("kpbench: nees is not compared, only"), "before a file is read"
 
 
 def test_the_table_of_images_adds_up(here):

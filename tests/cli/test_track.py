@@ -67,6 +67,8 @@ def test_poses_are_scored(films, tracked, tmp_path):
     failed = kpbench("score", poses, "--gt", films, "--min", "frames_with_pose=1.1", code=1)
     assert "frames_with_pose" in failed.stderr
     kpbench("score", poses, code=2)
+    refused = kpbench("score", poses, "--gt", films, "--report", tmp_path / "report.html", code=2)
+    assert "holds poses; --report is for detections, expected only --gt, --json, --min, --max" in refused.stderr
 
 
 def test_csv_and_jsonl_hold_the_same_poses(films, tracked):

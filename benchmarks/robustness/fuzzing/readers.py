@@ -19,6 +19,7 @@ import kpbench.predictions
 import kpbench.synth
 import kpbench.training
 from kpbench.benchmark.rerun import read_scores_json
+from kpbench.boards import read_poses
 from kpbench.camera import load_camera_preset
 
 from . import binary_references, reading, references, seeds
@@ -119,6 +120,19 @@ ALL_READERS = (
     Reader(
         "scores", "input.json", seeds.scores, of_json("suite", "name", "fingerprint", "sha256", "config"),
         read_scores_json, json.loads, imports=DATA,
+    ),
+    Reader(
+        "poses-jsonl", "input.jsonl", lambda: seeds.poses(".jsonl"), change_jsonl,
+        read_poses, reading.is_jsonl, references.poses,
+    ),
+    Reader(
+        "poses-csv", "input.csv", lambda: seeds.poses(".csv"), lambda rng, data: mutate_csv(rng, data.decode()),
+        read_poses, reading.is_poses_csv,
+    ),
+    Reader(
+        "marked-board", "input.json", seeds.marked_boards,
+        of_json("references", "corners_mm", "dictionary", "id", "x_mm", "print_scale"),
+        lambda path: kpbench.load_board(path).references, json.loads,
     ),
     Reader(
         "manifest", "dataset.json", seeds.manifests,

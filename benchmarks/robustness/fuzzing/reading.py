@@ -23,7 +23,7 @@ def read_dataset(folder: Path) -> Any:
     dataset = kpbench.open_dataset(folder)
     list(dataset.verify())
     for n in range(min(len(dataset), 3)):
-        dataset.image(n), dataset.keypoints(n), dataset.effects(n)
+        dataset.image(n), dataset.keypoints(n), dataset.ignored(n), dataset.effects(n)
     assert dataset.truth is not None
     return dataset
 
@@ -119,6 +119,11 @@ def is_hdf5(data: bytes) -> None:
 def is_csv(data: bytes) -> None:
     first, *lines = data.decode("utf-8-sig").splitlines()
     assert {"image_id", "x", "y"} <= {name.strip() for name in (lines[0] if first[:1] == "#" else first).split(",")}
+
+
+def is_poses_csv(data: bytes) -> None:
+    lines = data.decode("utf-8-sig").splitlines()
+    assert "image_id" in lines[1]
 
 
 def is_parquet(data: bytes) -> None:

@@ -206,9 +206,11 @@ def coco(data: bytes, found: Any) -> str:
     if truth.image_id.tolist() != ids:
         return "image ids differ"
     expected: dict[int, list[tuple[float, ...]]] = {image_id: [] for image_id in ids}
+    crowds: dict[int, list[tuple[float, ...]]] = {image_id: [] for image_id in ids}
     for entry in content["annotations"]:
         x, y, v = map(number, entry["keypoints"])
-        if v > 0:
+        is_crowd = entry.get("iscrowd") == 1
+        if v > 0 or (is_crowd and not (entry.get("radius_major") is None and entry.get("radius") is None)):
             major = entry.get("radius_major")
             major = number(entry["radius"] if major is None else major)
             minor = entry.get("radius_minor")
@@ -217,18 +219,34 @@ def coco(data: bytes, found: Any) -> str:
                 raise Refusal("a radius of 0 or less")
             angle, visible = number(entry.get("axis_angle", 0.0)), number(entry.get("visible", 1.0))
             sizes = np.array([major, minor, angle, visible], np.float32).astype(float).tolist()
-            expected[whole(entry["image_id"])].append((x, y, whole(entry["category_id"], 2**15) - 1, *sizes))
+            rows = crowds if is_crowd else expected
+            rows[whole(entry["image_id"])].append((x, y, whole(entry["category_id"], 2**15) - 1, *sizes))
     names = ("x", "y", "patch_id", "radius_major", "radius_minor", "axis_angle", "visible")
     for n, image_id in enumerate(ids):
         got = truth.keypoints[truth.offsets[n] : truth.offsets[n + 1]][list(names)].tolist()
         if got != expected[image_id]:
             return f"keypoints differ: image {image_id}, {got} of {expected[image_id]}"[:300]
+        if found.ignored(n)[list(names)].tolist() != crowds[image_id]:
+            return f"ignored patches differ: image {image_id}"
     for n, image in enumerate(content["images"]):
         if str(truth.condition[n]) != image.get("condition", ""):
             return f"condition differs: {str(truth.condition[n])!r} of {image.get('condition', '')!r}"[:200]
         rung = image.get("rung")
         if rung is not None and truth.rung[n] != number(rung):
             return f"rung differs: {truth.rung[n]} of {rung}"
+    return ""
+
+
+def poses(data: bytes, found: Any) -> str:
+    """Whether the poses of a file of JSON lines are those that its lines tell."""
+    lines = [loads(line) for line in data.decode("utf-8-sig").splitlines()[1:] if line.strip()]
+    if [line["image_id"] for line in lines] != [pose["image_id"] for pose in found]:
+        return "image ids differ"
+    for line, pose in zip(lines, found, strict=True):
+        for one, other in ((line, pose), (line["filtered"] or {}, pose["filtered"] or {})):
+            for name in ("rotation", "translation_mm") if one.get("rotation") is not None else ():
+                if not np.array_equal(np.array(one[name], float), np.array(other[name])):
+                    return f"{name} differs: image {line['image_id']}"
     return ""
 
 
@@ -269,9 +287,11 @@ def shard(data: bytes, found: Any) -> str:
                 return f"{name} differs"
         if [v.decode() for v in np.asarray(file["condition"][()], object)] != truth.condition.tolist():
             return "condition differs"
-        if file["keypoints"][()].tobytes() != truth.keypoints.tobytes():
+        rows = file["keypoints"][()]
+        judged = rows["sigma_x"] != np.inf if "sigma_x" in rows.dtype.names else np.ones(len(rows), bool)
+        if rows[judged].tobytes() != truth.keypoints.tobytes():
             return "keypoints differ"
-        offsets = file["offsets"][()].tolist()
+        offsets = np.append(0, np.cumsum(judged))[file["offsets"][()]].tolist()
         if truth.offsets.tolist() != offsets:
             return f"offsets differ: {truth.offsets.tolist()} of {offsets}"[:200]
         if len(set(truth.image_id.tolist())) < len(truth.image_id):

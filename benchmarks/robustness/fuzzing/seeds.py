@@ -108,6 +108,62 @@ def coco() -> list[bytes]:
 # --- Datasets ------------------------------------------------------------------------------------------------------
 
 
+class Photographs:
+    """Two labelled photographs, each with a keypoint and an ignored patch."""
+
+    n, shard_size, image_bytes, most_keypoints = 2, 2, 4000, 2
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the configuration."""
+        patches = [patch.to_dict() for patch in kpbench.shipped_patches()]
+        return {"kind": "photographs", "source": "photographs", "n": 2, "shard_size": 2, "patches": patches}
+
+    def scene_id(self, index: int) -> int:
+        """Return the scene of an image."""
+        return index
+
+    def make(self, index: int) -> tuple[Any, tuple[str, ...]]:
+        """Make an image."""
+        keypoints = np.zeros(2, kpbench.LABELLED_KEYPOINT_DTYPE)
+        keypoints["x"], keypoints["y"], keypoints["sigma_x"] = (20, 50), (30, 10), (0.01, np.inf)
+        keypoints["sigma_y"], keypoints["radius_major"], keypoints["radius_minor"] = keypoints["sigma_x"], 9, 8
+        keypoints["H_patch2image"] = np.eye(3)
+        return kpbench.dataset.Sample(index, pixels(64, 64)[..., 0], keypoints, condition="free"), ()
+
+
+def poses(suffix: str) -> list[bytes]:
+    """Files of poses: none, one, and one with a second solution and a filtered pose."""
+    from kpbench.boards import BoardPose, PoseRecord, write_poses
+
+    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    pose = BoardPose(turned, np.array([1.5, -2, 300]), 0.01 * np.eye(6), 0.2, 6)
+    unsure = replace(pose, second=replace(pose, rotation=np.eye(3)), ambiguous=True)
+    records = [
+        PoseRecord(0, "a.png", None, None, "grid", None, "the board was not found"),
+        PoseRecord(1, "b.png", 3, 0.12, "grid", pose, ""),
+        PoseRecord(2, "c.png", 4, 0.16, "grid", unsure, "", "tracked", pose),
+    ]
+    files = []
+    with folder() as where:
+        for some in (records, records[1:]):
+            write_poses(where / f"p{suffix}", some)
+            files.append((where / f"p{suffix}").read_bytes())
+    return files
+
+
+def marked_boards() -> list[bytes]:
+    """Sidecars of boards with reference marks, and of a field."""
+    files = []
+    with folder() as where:
+        for board in (
+            kpbench.truth_board(kpbench.shipped_patches()),
+            kpbench.with_reference(kpbench.hexagon_board(kpbench.shipped_patches()[1], 100.0)),
+        ):
+            kpbench.print_boards([board], where, formats=["svg"])
+            files.append((where / f"{board.name}.json").read_bytes())
+    return files
+
+
 def datasets() -> list[tuple[bytes, bytes]]:
     """Manifest and shard of datasets with one shard."""
     made = []
@@ -118,6 +174,7 @@ def datasets() -> list[tuple[bytes, bytes]]:
         kpbench.SynthConfig(2, size_px=(64, 64)),
         kpbench.SynthConfig(2, size_px=(64, 64), channels=3),
         kpbench.SuiteConfig(suite, images=1),
+        Photographs(),
     )
     for config in configs:
         with folder() as where:
