@@ -143,8 +143,8 @@ def test_the_command_tells_the_difference_to_the_paper(here):
     done = kpbench("bench", *arguments, "--detector", "mine:corners")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in done.stdout.splitlines() if "|" in line]
     paper = next(row for row in rows if row[:2] == ["detection", "paper"])
-    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners 1"])
-    less = next(row for row in rows if row[:2] == ["detection", "mine:corners 1 less the paper"])
+    ours = next(row for row in rows if row[:2] == ["detection", "mine:corners"])
+    less = next(row for row in rows if row[:2] == ["detection", "mine:corners less the paper"])
     assert paper[2:] == ["photographs", "1.000", "0.986", "0.882", "0.605"]
     for theirs, value, between in zip(paper[3:], ours[3:], less[3:], strict=True):
         assert abs(float(value.split()[0]) - float(theirs) - float(between.split()[0])) < 0.0011

@@ -51,6 +51,7 @@ def degrade(
       blur 3 7 11 15 px · dimming 10 20 30 40 · noise 15 30 45 60 grey levels · motion-blur 5 10 20 30 px
       defocus 2 4 6 9 px · shadow-edge 30 50 70 90 % · rain 500 1000 2000 4000 · jpeg 50 25 10 5
       low-light 4 6 8 9 stops · occlusion 10 20 30 40 % · flare 60 120 180 240
+      hand 25 45 70 95 % · cable 1 2 4 8 cables
       gaussian-blur and dimming-literal are in no suite
 
     \b

@@ -105,7 +105,7 @@ def detect(
       superpoint          large network
       template            no network; with --patches, designs of your own
       orb, sift           points without IDs
-      aruco, apriltag, charuco    tags, for comparison
+      aruco, apriltag, charuco, napa, locus    tags, for comparison
       FILE.onnx           weights of your own, from kpbench export-model
       MODULE:ATTR         a function or class in Python
       program:COMMAND     a program in any language

@@ -184,15 +184,13 @@ class VerifierConfig:
     sets : tuple of VerifierSet
         Images to train on.
     test : VerifierSet
-        Images on which log odds are calibrated and the reports are measured.
+        Images that calibrate log odds, place the threshold and measure reports, over photographs that train nothing.
     ellipse_epochs, judge_epochs : int
         Passes over the places, and over the hypotheses.
     first_sets : int
-        Number of ``sets``, from the first one on, that train judges which only serve to correct poses for the judges
-        that are kept.
+        Number of ``sets``, from the first one on, whose judges only correct poses for the judges that are kept.
     alarms_per_image : float
-        Largest number of false alarms per image of ``test`` at a score of 0.5, from which on a detector reports. All
-        photographs of ``test`` are photographs that trained nothing.
+        Largest number of false alarms per image of ``test`` at the score from which on a detector reports.
 
     Examples
     --------

@@ -19,6 +19,7 @@ from kpbench.analysis.identity import correlation_and_distance
 from kpbench.analysis.localisation import design_bound
 from kpbench.degrade.blurs import gaussian_blur
 from kpbench.degrade.effects import noise
+from kpbench.files import read_bytes
 from kpbench.geometry.camera import Camera, plane_to_camera, rotation_xyz
 from kpbench.patches.board import Board
 from kpbench.patches.board_file import DEFAULT_DIAMETER_MM, load_boards
@@ -280,7 +281,7 @@ def print_files(design: Patch, choice: PrintChoice, formats: Sequence[str]) -> d
             diameter_mm = choice.diameter_mm or DEFAULT_DIAMETER_MM
             patches = chosen_designs(design, choice)
             files = print_patches(patches, folder, diameter_mm=diameter_mm, copies=choice.copies, **layout)
-        return {path.name: path.read_bytes() for path in files}
+        return {path.name: read_bytes(path, is_noted=False) for path in files}
 
 
 def download_of(design: Patch, choice: PrintChoice, form: str) -> tuple[str, bytes]:

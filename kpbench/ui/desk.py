@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from kpbench.errors import DataError, KpbenchError
-from kpbench.files import read_text
+from kpbench.files import open_file, read_text
 from kpbench.films import VIDEO_SUFFIXES
 from kpbench.geometry.camera import Camera
 from kpbench.geometry.camera_file import read_camera
@@ -181,7 +181,7 @@ class Desk:
 
 
 def _head(path: Path) -> bytes:
-    with path.open("rb") as file:
+    with open_file(path, is_noted=False) as file:
         return file.read(16)
 
 

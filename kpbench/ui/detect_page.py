@@ -26,7 +26,7 @@ PLOTTED = 300
 """Number of the newest images whose poses are plotted."""
 SEEN_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
 SETTING_SUFFIXES = (*CALIBRATION_SUFFIXES, ".toml")
-AXES = ("x", "y", "z")
+AXIS_NAMES = ("x", "y", "z")
 AXIS_COLOURS = ("#d55e00", "#009e73", "#56b4e9")
 POINT_COLUMNS = {"design": "design", "x": "x px", "y": "y px", "radii": "radii px", "score": "score"}
 
@@ -289,12 +289,12 @@ def _plot(sights: list[SeenImage]) -> dict[str, Any]:
             ],
         }
         for row in (0, 1)
-        for n, (name, colour) in enumerate(zip(AXES, AXIS_COLOURS, strict=True))
+        for n, (name, colour) in enumerate(zip(AXIS_NAMES, AXIS_COLOURS, strict=True))
     ]
     return {
         "animation": False,
         "textStyle": style,
-        "legend": {"data": [*AXES], "textStyle": style, "top": 0},
+        "legend": {"data": [*AXIS_NAMES], "textStyle": style, "top": 0},
         "tooltip": {"trigger": "axis"},
         "grid": [
             {"top": 44, "height": 90, "left": 60, "right": 16},

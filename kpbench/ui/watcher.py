@@ -24,6 +24,7 @@ from kpbench.boards.pose_files import write_poses
 from kpbench.dataset.drawing import draw_detections
 from kpbench.detectors.interface import LoadedDetector, load_detector
 from kpbench.errors import DataError, KpbenchError, one_line
+from kpbench.files import read_bytes
 from kpbench.geometry.camera import Camera
 from kpbench.images import UNDECODABLE, ImageSource, encode_jpeg, open_images
 from kpbench.patches.board import Board
@@ -340,7 +341,7 @@ def _written(name: str, write: Callable[[Path], None]) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         write(path)
-        return path.read_bytes()
+        return read_bytes(path, is_noted=False)
 
 
 def point_rows(sight: SeenImage, names: Mapping[int, str]) -> list[dict[str, Any]]:

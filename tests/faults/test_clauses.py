@@ -81,6 +81,7 @@ WRITERS = {
     "dataset/export.py": "removes hidden parts of an export",
     "benchmark/detection.py": "removes an empty folder",
     "detectors/program.py": "the temporary folder",
+    "ui/desk.py": "removes uploads of its temporary folder",
 }
 """Modules that write or remove files by themselves, and what."""
 WRITING = {
@@ -94,13 +95,13 @@ WRITING = {
     "rmdir",
     "copyfileobj",
 }
-WRITING |= {"imwrite", "VideoWriter", "rmtree", "copy2", "copyfile", "copytree", "truncate", "link", "chmod"}
+WRITING |= {"imwrite", "VideoWriter", "rmtree", "copy2", "copyfile", "copytree", "truncate", "chmod"}
 
 
 def writes(node):
     """Whether a call writes or removes a file."""
     name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-    if name in WRITING or ast.unparse(node.func) in ("os.replace", "os.remove", "shutil.move"):
+    if name in WRITING or ast.unparse(node.func) in ("os.replace", "os.remove", "os.link", "shutil.move"):
         return True
     modes = [a.value for a in [*node.args, *(k.value for k in node.keywords)] if isinstance(a, ast.Constant)]
     return name == "open" and any(isinstance(m, str) and set(m) & set("wax+") and len(m) < 4 for m in modes)

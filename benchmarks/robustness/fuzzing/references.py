@@ -389,6 +389,8 @@ def toml_suite(data: bytes, found: Any) -> str:
             "camera": dict(got.camera),
             "board": got.board,
             "film": dict(got.film),
+            "clutter": got.clutter,
+            "paper_px2": got.paper_px2,
         }
         if difference := _first_difference(table, given):
             return difference
