@@ -39,7 +39,7 @@ DRAWN_RADIUS_PX = 20
 """Radius of the drawing in which the detector has to find each design, px."""
 SURROUNDED_PX = 24.0
 """Noise and grey range are measured in the coarsest level in which the short semi-axis is at least this many px."""
-VERSION = "3"
+VERSION = "4"
 """Version of the method. Raise the version by one when detections change."""
 
 

@@ -57,7 +57,7 @@ from kpbench.patches.design import Patch
 from kpbench.types import Float, Float32, Int, UInt8
 from kpbench.workers import one_blas_thread
 
-VERIFIER = "10"
+VERIFIER = "11"
 """Version of the method. Raise the version by one when detections change for any reason other than new weights."""
 WEIGHTS = Path(__file__).parent / "weights"
 """Folder of the shipped networks."""

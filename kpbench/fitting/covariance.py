@@ -72,8 +72,8 @@ def centre_covariance(
         Matrix of the normal equations, with priors.
     change : ndarray of shape (k,)
         The last step.
-    prior : ndarray of shape (p,)
-        What the priors add to the diagonal of ``normal``, for the last p unknowns.
+    prior : ndarray of shape (k,)
+        What the priors add to the diagonal of ``normal``.
     grain : float
         From :func:`noise_grain`.
     """
@@ -82,8 +82,7 @@ def centre_covariance(
     left = residual - change.astype(np.float32) @ moves
     variance = max(float((left * weight) @ left) / max(total - len(moves), 1.0), LEAST_VARIANCE)
     influence = inverse[2:4].astype(np.float32) @ weighted
-    unsure = inverse[2:4, -len(prior) :]
     # rounding to whole grey levels has no grain
     grained = LEAST_VARIANCE + grain * (variance - LEAST_VARIANCE)
     noise = grained * (influence @ influence.T).astype(np.float64)
-    return np.asarray(noise + variance * (unsure * prior) @ unsure.T)
+    return np.asarray(noise + variance * (inverse[2:4] * prior) @ inverse[2:4].T)

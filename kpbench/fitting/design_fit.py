@@ -39,6 +39,9 @@ LEVEL_BLUR_PX = 0.6
 """Standard deviation of the pyramid's own blur in every level but level 0, px of the level."""
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective: standard deviation of the bend, per px of the short semi-axis."""
+EXPECTED_STRETCH = 0.03
+"""Prior of the map: standard deviation of its change from the starting map, as a share of the patch's reach along x for
+the first row, along y for the second. The pixels of a design of sectors alone do not tell its size."""
 EXPECTED_TONE = 0.25
 """Prior of the tone curve: standard deviation of both coefficients."""
 EXPECTED_GAIN = 0.004
@@ -53,10 +56,12 @@ LARGEST_EXTRAS = np.array([0.3, 0.3, 1.5, 1.0, 0.03, 0.5, 0.3, 0.3, 0.7, 0.7])
 """Largest size of the extras: of k1 for the lens, per short semi-axis for the light, per blur variance for the
 unevenness. Steeper tone curves fall."""
 EXTRA_POWERS = np.array([0, 0, 0, 0, 0, -2, -1, -1, 2, 2])  # powers of px in the units of the extras
-FINE_EXTRAS = [3, 8, 9]
-"""The coarse steps leave these extras, which would follow errors of the pose."""
 EXTRAS, UNKNOWNS = 10, 19
-"""Numbers of unknowns with a prior, and of all unknowns."""
+"""Numbers of unknowns that are extras, and of all unknowns."""
+PRIOR_AT = np.array([4, 5, 6, 7, *range(UNKNOWNS - EXTRAS, UNKNOWNS)])
+"""Places of the unknowns with a prior: the map and the extras."""
+FINE_PRIORS = [7, 12, 13]
+"""The coarse steps leave the extras with these priors, which would follow errors of the pose."""
 LEAST_SHRINK, LARGEST_GROWTH = 0.1, 1.5
 """A step changes the blur's variance v to ``LEAST_SHRINK`` v at least, ``LARGEST_GROWTH`` (v + 1 px²) at most."""
 MARGIN_BLURS = 1.6
@@ -364,21 +369,21 @@ def _solve_step(
     stepped : _State
     change : ndarray of shape (19,)
         Change of the unknowns.
-    prior : ndarray of shape (10,)
-        What is added to the diagonal of ``normal`` for the extras.
+    prior : ndarray of shape (19,)
+        What the priors add to the diagonal of ``normal``.
     """
-    # the pixels of a design of sectors alone do not determine its size and some stretches, so damping holds them
     diagonal = normal.reshape(-1)[:: len(normal) + 1]
-    diagonal[4:9] += 1e-2 * diagonal[4:9] + 1e-3
-    diagonal[:4] += 1e-3
+    diagonal[8] *= 1 + 1e-2
+    diagonal[:9] += 1e-3
     bend, side, light = EXPECTED_BEND_PER_PX * minor, 2 * float(state.middle.max()) + 1, EXPECTED_LIGHT / minor
     expected = [bend, bend, EXPECTED_TONE, EXPECTED_TONE, EXPECTED_GAIN, EXPECTED_LENS / side**2, light, light]
     expected += [EXPECTED_UNEVEN_PX2 / 4.0**level] * 2
-    prior = (state.noise**2 + 1) / np.square(expected)
+    reach = np.sqrt((state.window**2).sum(axis=1)).repeat(2)
+    prior = (state.noise**2 + 1) / np.square([*EXPECTED_STRETCH * reach, *expected])
     if is_coarse:
-        prior[FINE_EXTRAS] *= 1e6
-    diagonal[-EXTRAS:] += prior
-    target[-EXTRAS:] -= prior * state.extras
+        prior[FINE_PRIORS] *= 1e6
+    diagonal[PRIOR_AT] += prior
+    target[PRIOR_AT] -= prior * [*(state.A - state.window).ravel(), *state.extras]
     delta = np.linalg.solve(normal, target)
     shift = delta[2:4] * min(1.0, 0.3 * minor / max(float(np.hypot(*delta[2:4].tolist())), 1e-9))
     grow = delta[4:8] * min(1.0, 0.2 * minor / max(float(np.abs(delta[4:8]).max()), 1e-9))
@@ -393,4 +398,6 @@ def _solve_step(
     moved /= min(SETTLED_PX / 2.0**level, SETTLED_SHARE * minor)
     change = np.array([*delta[:2], *shift, *grow, blur**2 - variance, *(extras - state.extras)])
     stepped = replace(state, xy=state.xy + shift, A=state.A + grow.reshape(2, 2), extras=extras, blur=blur, moved=moved)
-    return stepped, change, prior
+    added = np.zeros(UNKNOWNS)
+    added[PRIOR_AT] = prior
+    return stepped, change, added

@@ -98,3 +98,13 @@ def test_where_there_is_no_patch_nothing_breaks():
     none = fit(flat, np.zeros((0, 2)), np.zeros((0, 2, 2)), [])
     assert none.xy.shape == (0, 2)
     assert none.ncc.shape == (0,)
+
+
+@pytest.mark.parametrize("patch", PATCHES, ids=lambda patch: patch.name)
+def test_noise_does_not_move_the_size_of_a_small_patch(patch):
+    """The edges of a checker do not tell its size; the starting pose, which saw the rim, does."""
+    xy, A = np.array([44.3, 45.8]), np.eye(2) * 6.0
+    clean = blur(render_design(patch, A, xy), 3)
+    found = [fit_one(noise(clean, np.random.default_rng(k), 10.0), xy, A, patch).A[0] for k in range(12)]
+    sizes = np.sqrt(np.linalg.det(found)) / 6.0
+    assert np.abs(sizes - 1).max() < 0.08
