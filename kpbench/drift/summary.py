@@ -32,7 +32,7 @@ def summarise_difference(difference: DatasetDifference) -> str:
         for letter, about in zip("AB", difference.about, strict=True)
     ]
     fields = difference.config
-    lines.append(f"{'config':<14} {f'{len(fields)} fields differ' if fields else 'the same'}")
+    lines.append(f"{'config':<14} {'differs' if fields else 'the same'}")
     lines += [f"  {field}: {_shorten(old)} -> {_shorten(new)}" for field, (old, new) in fields.items()]
     lines += [*_describe_truth(difference.truth), *_describe_pixels(difference.pixels)]
     drifted = [d.name.split(",")[0] for d in difference.drifted]
