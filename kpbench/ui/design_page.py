@@ -122,7 +122,8 @@ class DesignPage:
             moves = (("arrow_upward", up, "up", n > 0), ("arrow_downward", down, "down", n < last))
             for icon, move, where, is_possible in (*moves, ("delete", away, "away", True)):
                 button = ui.button(icon=icon, on_click=partial(self.edit, move, True)).props("flat round dense")
-                button.props(f'aria-label="move semi-circle {n + 1} {where}"').set_enabled(is_possible)
+                name = f"remove semi-circle {n + 1}" if where == "away" else f"move semi-circle {n + 1} {where}"
+                button.props(f'aria-label="{name}"').set_enabled(is_possible)
 
     def _make_slider(self, n: int, key: str, value: float, low: float, high: float, step: float, title: str) -> None:
         """Make a number and a slider for one value of a semi-circle. The number takes any value, the slider some."""
@@ -199,7 +200,9 @@ class DesignPage:
                 self._field(sheet, "sheet")
                 self._field(ui.select(DESIGN_CHOICES, label="Designs", value=choice.designs), "designs")
                 self._field(
-                    ui.number("Diameter (mm)", placeholder="usual", value=choice.diameter_mm, min=0.1, max=5000),
+                    ui.number("Diameter (mm)", placeholder="usual", value=choice.diameter_mm, min=0.1, max=5000).props(
+                        "stack-label"
+                    ),
                     "diameter_mm",
                 )
                 self._field(ui.input("Page", value=choice.page, autocomplete=list(PAGE_SIZES_MM)), "page")
@@ -245,7 +248,7 @@ class DesignPage:
             files = await in_worker(print_files, design, choice, ["svg"])
             problems = [problem for board in chosen_boards(design, choice) if (problem := pose_problem(board))]
         except KpbenchError as error:
-            self.print_problem.text, self.print_note.text, self.sheet.content = str(error), "", ""
+            self.print_problem.text, self.print_note.text, self.sheet.content = _said_here(error), "", ""
             return
         pages = [name for name in files if name.endswith(".svg")]
         self.print_problem.text = ""
@@ -259,9 +262,14 @@ class DesignPage:
         try:
             name, content = await in_worker(download_of, self.desk.design, self.desk.choice, form)
         except KpbenchError as error:
-            self.print_problem.text = str(error)
+            self.print_problem.text = _said_here(error)
             return
         ui.download.from_url(self.desk.offer(name, content), name)
+
+
+def _said_here(error: KpbenchError) -> str:
+    """Return a message with what the page calls an argument of Python."""
+    return str(error).replace("`tile=True`", f"'{SWITCHES['tile']}'")
 
 
 def _picture(image: UInt8, text: str) -> str:

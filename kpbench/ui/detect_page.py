@@ -47,6 +47,7 @@ class DetectPage:
                     {"name": key, "label": label, "field": key, "align": "left"} for key, label in POINT_COLUMNS.items()
                 ]
                 self.table = ui.table(rows=[], columns=columns, row_key="n").classes("kp-full").props("dense flat")
+                self.table.props('no-data-label="no points"')
             with ui.element("section").classes("kp-card") as self.plot_card:
                 ui.html("<h2>Pose over time</h2>", sanitize=False)
                 self.plot = (
@@ -61,7 +62,7 @@ class DetectPage:
             ui.html("<h2>Source</h2>", sanitize=False)
             _make_upload("Drop photographs or a film here", SEEN_SUFFIXES, self.take_images, self.refuse)
             with ui.element("div").classes("kp-row"):
-                camera = ui.number("Camera", value=0, min=0, max=99, precision=0).style("width: 90px")
+                camera = ui.number("Camera number", value=0, min=0, max=99, precision=0).style("width: 120px")
                 ui.button("Open the camera", on_click=lambda: self.open_camera(camera.value)).props("outline")
             self.problem = ui.label().classes("kp-problem").props('role="alert"')
 
@@ -77,9 +78,9 @@ class DetectPage:
             with ui.element("div").classes("kp-row"):
                 self.camera = ui.select(desk.camera_names(), label="Camera", value=desk.camera_name).classes("kp-grow")
                 self.camera.on_value_change(lambda e: self.look(camera_name=e.value))
-                self.view = ui.number("Field of view (°)", value=desk.view_deg, min=5, max=150, step=1).classes(
-                    "kp-grow"
-                )
+                self.view = ui.number(
+                    "Field of view, longer side (°)", value=desk.view_deg, min=5, max=150, step=1
+                ).classes("kp-grow")
                 self.view.on_value_change(lambda e: self.look(view_deg=e.value))
                 self.view.bind_visibility_from(self.camera, "value", value=VIEW_CAMERA)
             text = "A board's file (.json, .toml), or a calibration"
@@ -253,8 +254,10 @@ def _make_upload(text: str, suffixes: tuple[str, ...], take: Any, refuse: Any) -
         on_rejected=refuse,
     )
     upload.classes("kp-full").props(f'flat bordered accept="{",".join(suffixes)}"')
-    for event in ("uploaded", "failed"):  # once the browser has the answer; earlier, it would abort the upload
-        upload.on(event, js_handler=f"() => runMethod({upload.id}, 'reset', [])")
+    # After the event: a reset within it aborts the request before the browser ends it, and the page would show for ever
+    # that it loads.
+    for event in ("uploaded", "failed"):
+        upload.on(event, js_handler=f"() => setTimeout(() => runMethod({upload.id}, 'reset', []))")
     upload.on("failed", refuse, args=[])
     button = ui.button("Choose files", icon="folder_open").props("outline").props(f'aria-label="choose files: {text}"')
     button.on("click", js_handler=f"() => runMethod({upload.id}, 'pickFiles', [])")

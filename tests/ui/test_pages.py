@@ -167,7 +167,7 @@ def test_a_patch_is_designed_and_printed(address, open_page, here):
     assert "a9" in problem(page, "`page` is 'a9'")
     page.get_by_label("Page", exact=True).fill("a4")
     page.wait_for_selector("img.kp-sheet")
-    page.get_by_role("button", name="move semi-circle 3 away").click()
+    page.get_by_role("button", name="remove semi-circle 3").click()
     playwright.expect(page.get_by_role("group", name="semi-circle 3")).to_have_count(0)
 
 
@@ -215,8 +215,10 @@ def test_the_keyboard_reaches_everything_in_a_narrow_dark_window(address, open_p
         page.keyboard.press("Enter")
     chooser.value.set_files(scene / "photo.png")
     status(page, "photo.png")
+    page.wait_for_selector(".q-loading-bar[aria-hidden]", state="attached")
     page.get_by_role("button", name="light or dark").focus()
     page.keyboard.press("Enter")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "solid"
     page.wait_for_function("!document.body.classList.contains('body--dark')")
     page.keyboard.press("Enter")
     page.wait_for_function("document.body.classList.contains('body--dark')")
