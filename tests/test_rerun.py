@@ -81,8 +81,17 @@ def test_a_moved_detection_is_refuted(submission):
 
 def test_better_scores_than_the_predictions_give_are_refuted(submission):
     scores = submission / "bench" / "scores" / "paper-v1" / "sift.json"
-    edit(scores, lambda c: c["metrics"].update(detection_score=1.0))
-    assert problem(submission) == "its scores do not follow from its predictions"
+    honest_text = scores.read_text()
+    for change in (
+        lambda c: c["metrics"].update(detection_score=1.0),
+        lambda c: c["metrics"].update(f1=1.0),
+        lambda c: c["metrics"]["intervals"].update(detection_score=[0.9, 1.0]),
+        lambda c: c["by"][0].update(rung=99.0),
+        lambda c: c.update(by=[1]),
+    ):
+        scores.write_text(honest_text)
+        edit(scores, change)
+        assert problem(submission, percent=1) == "its scores do not follow from its predictions"
 
 
 def test_another_suite_another_truth_and_another_version_are_refuted(submission):

@@ -138,6 +138,8 @@ def detect(
     images = open_source(*sources, overlay=overlay)
     hint = "; --overlay FOLDER draws them" if (out, overlay) == (None, None) and isinstance(images, ImageSource) else ""
     is_shown = out is None and isinstance(images, ImageSource) and images.length == 1 and Path(sources[0]).is_file()
+    if cost and (is_streamed or is_shown):
+        raise click.UsageError("--cost needs a predictions file; give --out FILE")
     overlay = Path(f"{Path(sources[0]).stem}-found.png") if is_shown and overlay is None else overlay
     out = out or Path("preds.json")
     if not (is_streamed or is_shown):
