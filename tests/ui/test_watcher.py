@@ -191,6 +191,7 @@ def test_a_list_of_files_is_no_film(tmp_path):
     path.write_text("ffconcat version 1.0\nfile /etc/passwd\n")
     with pytest.raises(DataError, match=r"^\.\./list\.mp4: cannot be opened as a video, expected AVI"):
         desk.drop([("../list.mp4", path)])
+    assert not path.exists()
 
 
 def test_old_files_and_downloads_go(tmp_path):
