@@ -18,8 +18,8 @@ from kpbench.calibration.shape import PrintShape
 from kpbench.errors import DesignError, KpbenchWarning
 from kpbench.patches.board_file import load_board
 from kpbench.patches.board_sidecar import load_sidecar_json
-from kpbench.printing.sidecar import correct_sidecar
-from kpbench.toml import TomlTable
+from kpbench.printing.sidecar import correct_sidecar, require_uncorrected
+from kpbench.toml import TomlTable, name_source
 from kpbench.writing import write_file
 
 RULER_SIGMA_MM = 0.1
@@ -64,7 +64,7 @@ def check_print(
         Photographs of one camera, as for :func:`kpbench.calibrate`. Some need to be taken with the camera turned by 90
         degrees: else the ratio of the scales cannot be told from the shape of the camera's pixels.
     sidecar : str or Path
-        Sidecar of the board.
+        Sidecar of the board as designed, not one that a print check wrote.
     progress : callable
         As for :func:`kpbench.calibrate`.
 
@@ -82,6 +82,8 @@ def check_print(
     kpbench.errors.DesignError: missing.json: cannot be read, No such file or directory
     """
     content = load_sidecar_json(sidecar)
+    with name_source(sidecar, DesignError):
+        require_uncorrected(content)
     calibration = calibrate(photos, load_board(sidecar), progress=progress)
     x, y = TomlTable(content, content.keys(), DesignError).numbers("ruler_mm", 0, count=2)
     values = _measure(calibration)
