@@ -13,6 +13,7 @@ from kpbench.benchmark.reports import write_suite_reports
 from kpbench.benchmark.rerun import verify_submission
 from kpbench.benchmark.run import bench
 from kpbench.errors import DataError
+from kpbench.files import shipped_files
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
@@ -105,6 +106,16 @@ def test_another_suite_another_truth_and_another_version_are_refuted(submission)
     scores.write_text(kept)
     edit(scores, lambda c: c["detector"].update(version="0.0"))
     assert problem(submission).startswith("its detector is '0.0', the one here")
+
+
+def test_a_suite_in_a_file_of_the_submission_is_refused(submission, monkeypatch):
+    monkeypatch.chdir(submission)
+    Path("easy.toml").write_text(shipped_files("suites")["paper-v1"].read_text().replace('"paper-v1"', '"easy.toml"'))
+    assert load_suite("easy.toml").name == "easy.toml"
+    scores = submission / "bench" / "scores" / "paper-v1" / "sift.json"
+    edit(scores, lambda c: c["provenance"]["config"].update(suite="easy.toml"))
+    with pytest.raises(DataError, match=r"sift\.json: .*'easy\.toml', which does not ship with kpbench"):
+        problem(submission)
 
 
 def test_code_that_a_submission_names_does_not_run(submission, monkeypatch):

@@ -21,7 +21,7 @@ from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import DETECTORS, load_detector
 from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
-from kpbench.files import load_json, read_bytes, sha256_of
+from kpbench.files import load_json, read_bytes, sha256_of, shipped_files
 from kpbench.predictions.files import read_predictions
 from kpbench.scoring.groups import GroupKey
 from kpbench.scoring.scores import SCHEMA, score
@@ -178,6 +178,8 @@ def read_scores_json(file: Path) -> dict[str, Any]:
 def _suite_config(recorded: Mapping[str, Any], file: Path, backgrounds: Path | None) -> SuiteConfig:
     """Return the configuration that makes the images of the recorded one."""
     try:
+        if recorded["suite"] not in shipped_files("suites"):  # such as the path of a file
+            raise ValueError(f"suite is {recorded['suite']!r}, which does not ship with kpbench")
         width, height = recorded["size_px"]
         names = tuple(str(condition["name"]) for condition in recorded["conditions"])
         board = recorded["board"]["name"] if "board" in recorded else None
