@@ -13,6 +13,7 @@ from kpbench.benchmark.reports import write_suite_reports
 from kpbench.benchmark.rerun import verify_submission
 from kpbench.benchmark.run import bench
 from kpbench.errors import DataError
+from kpbench.files import shipped_files
 from kpbench.predictions.files import read_predictions, write_predictions
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
@@ -81,8 +82,17 @@ def test_a_moved_detection_is_refuted(submission):
 
 def test_better_scores_than_the_predictions_give_are_refuted(submission):
     scores = submission / "bench" / "scores" / "paper-v1" / "sift.json"
-    edit(scores, lambda c: c["metrics"].update(detection_score=1.0))
-    assert problem(submission) == "its scores do not follow from its predictions"
+    honest_text = scores.read_text()
+    for change in (
+        lambda c: c["metrics"].update(detection_score=1.0),
+        lambda c: c["metrics"].update(f1=1.0),
+        lambda c: c["metrics"]["intervals"].update(detection_score=[0.9, 1.0]),
+        lambda c: c["by"][0].update(rung=99.0),
+        lambda c: c.update(by=[1]),
+    ):
+        scores.write_text(honest_text)
+        edit(scores, change)
+        assert problem(submission, percent=1) == "its scores do not follow from its predictions"
 
 
 def test_another_suite_another_truth_and_another_version_are_refuted(submission):
@@ -96,6 +106,16 @@ def test_another_suite_another_truth_and_another_version_are_refuted(submission)
     scores.write_text(kept)
     edit(scores, lambda c: c["detector"].update(version="0.0"))
     assert problem(submission).startswith("its detector is '0.0', the one here")
+
+
+def test_a_suite_in_a_file_of_the_submission_is_refused(submission, monkeypatch):
+    monkeypatch.chdir(submission)
+    Path("easy.toml").write_text(shipped_files("suites")["paper-v1"].read_text().replace('"paper-v1"', '"easy.toml"'))
+    assert load_suite("easy.toml").name == "easy.toml"
+    scores = submission / "bench" / "scores" / "paper-v1" / "sift.json"
+    edit(scores, lambda c: c["provenance"]["config"].update(suite="easy.toml"))
+    with pytest.raises(DataError, match=r"sift\.json: .*'easy\.toml', which does not ship with kpbench"):
+        problem(submission)
 
 
 def test_code_that_a_submission_names_does_not_run(submission, monkeypatch):

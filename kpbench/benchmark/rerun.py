@@ -21,8 +21,9 @@ from kpbench.dataset.folder import Dataset
 from kpbench.detectors.interface import DETECTORS, load_detector
 from kpbench.detectors.prediction import detect_images
 from kpbench.errors import DataError
-from kpbench.files import load_json, read_bytes, sha256_of
+from kpbench.files import load_json, read_bytes, sha256_of, shipped_files
 from kpbench.predictions.files import read_predictions
+from kpbench.scoring.groups import GroupKey
 from kpbench.scoring.scores import SCHEMA, score
 from kpbench.synth.suite import SuiteConfig
 from kpbench.synth.suite_file import load_suite
@@ -177,6 +178,8 @@ def read_scores_json(file: Path) -> dict[str, Any]:
 def _suite_config(recorded: Mapping[str, Any], file: Path, backgrounds: Path | None) -> SuiteConfig:
     """Return the configuration that makes the images of the recorded one."""
     try:
+        if recorded["suite"] not in shipped_files("suites"):  # such as the path of a file
+            raise ValueError(f"suite is {recorded['suite']!r}, which does not ship with kpbench")
         width, height = recorded["size_px"]
         names = tuple(str(condition["name"]) for condition in recorded["conditions"])
         board = recorded["board"]["name"] if "board" in recorded else None
@@ -221,8 +224,8 @@ def _rerun(
     if file is None:
         return (), f"no predictions file has the SHA-256 that the scores name, {str(named)[:16]}"
     predictions = read_predictions(file)
-    again = json.loads(json.dumps(score(dataset, predictions, resamples=0).to_dict()))
-    if not _counts_alike(again, content):
+    again = json.loads(json.dumps(score(dataset, predictions).to_dict()))
+    if not _are_alike(again, content):
         return (), "its scores do not follow from its predictions"
     recorded = content["detector"]
     name = detectors.get(recorded["name"], recorded["name"])
@@ -234,18 +237,28 @@ def _rerun(
     return _compare_sample(predictions, dataset, name, percent, seed)
 
 
-def _counts_alike(one: Mapping[str, Any], two: Mapping[str, Any]) -> bool:
-    """Return whether two scores have the same counts in all groups, and the same error."""
+def _are_alike(one: Mapping[str, Any], two: Mapping[str, Any]) -> bool:
+    """Return whether two scores have the same groups, and in all groups the same metrics and intervals."""
 
     def parts(scores: Mapping[str, Any]) -> Iterator[Any]:
-        for metrics in (scores["metrics"], *(group["metrics"] for group in scores["by"])):
-            yield metrics["counts"], metrics["detection_score"], metrics["average_false_alarm"]
-            yield round(metrics["error_median_px"] or 0.0, 6)
+        yield scores["settings"]
+        for group in (scores, *scores["by"]):
+            yield {key: group.get(key) for key in GroupKey._fields}
+            yield _rounded(group["metrics"])
 
     try:
         return list(parts(one)) == list(parts(two))
-    except (KeyError, TypeError):
+    except (KeyError, TypeError, AttributeError):
         return False
+
+
+def _rounded(value: Any) -> Any:
+    """Return numbers to seven digits, as machines and versions of NumPy sum in different orders."""
+    if isinstance(value, dict):
+        return {key: _rounded(part) for key, part in value.items()}
+    if isinstance(value, list):
+        return [_rounded(part) for part in value]
+    return f"{value:.7g}" if isinstance(value, float) else value
 
 
 def _compare_sample(

@@ -241,10 +241,10 @@ def _require_photos(observed: Sequence[Observed], source: str, least: int = LEAS
     return used
 
 
-def compare_halves(bundle: Bundle, board_mm: Float, *, solve_camera: bool = True) -> Halves | None:
+def compare_halves(bundle: Bundle, board_mm: Float) -> Halves | None:
     """Solve the first and the second half of the photographs apart, in the order of their names.
 
-    The parameters of the camera are compared; if the camera is known, those of the print.
+    Each half solves the camera, also if it is known; its parameters are compared.
     """
     from scipy.stats import chi2
 

@@ -180,8 +180,8 @@ def label(
         raise DataError(f"board {board.name!r} has no reference marks, expected some; print it with `reference`")
     text, paths = str(photos), dict(list_photos(photos, exclude=Path(out)))
     observed = observe_photos(photos, board, exclude=Path(out), progress=progress)
-    observed, bundle, is_solved = _solve(observed, board, camera, text)
-    halves = compare_halves(bundle, board_points_mm(board), solve_camera=is_solved)
+    observed, bundle = _solve(observed, board, camera, text)
+    halves = compare_halves(bundle, board_points_mm(board))
     shown = len(bundle.points) + sum(o.reason in ("does-not-fit", "outliers") for o in observed)
     _judge_halves(halves, shown, text, force)
     if abs(bundle.shape.ratio) > WRONG_RATIO:
@@ -220,10 +220,8 @@ def label(
     return LabelResult(dataset, tuple(observed), loo_px, error_px, halves)
 
 
-def _solve(
-    observed: list[Observed], board: Board, camera: Camera | None, source: str
-) -> tuple[list[Observed], Bundle, bool]:
-    """Solve the photographs; return whether the camera was solved, too."""
+def _solve(observed: list[Observed], board: Board, camera: Camera | None, source: str) -> tuple[list[Observed], Bundle]:
+    """Solve the photographs, and the camera if it is not given."""
     board_mm = board_points_mm(board)
     used = [o for o in observed if not o.reason]
     is_solved = camera is None
@@ -234,7 +232,7 @@ def _solve(
     camera = camera or Camera(1, 1, 1.0)
     observed, bundle = solve_and_reject(observed, board_mm, camera, source, solve_camera=is_solved)
     require_explained(bundle, source)
-    return observed, bundle, is_solved
+    return observed, bundle
 
 
 def _judge_halves(halves: Halves | None, photos: int, source: str, force: bool) -> None:

@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -17,10 +16,10 @@ from kpbench.calibration.ink import measure_ink_gain
 from kpbench.calibration.photos import as_grey, list_photos, read_photo
 from kpbench.calibration.shape import PrintShape
 from kpbench.errors import DesignError, KpbenchWarning
-from kpbench.files import load_json, read_text
 from kpbench.patches.board_file import load_board
-from kpbench.printing.sidecar import correct_sidecar
-from kpbench.toml import TomlTable
+from kpbench.patches.board_sidecar import load_sidecar_json
+from kpbench.printing.sidecar import correct_sidecar, require_uncorrected
+from kpbench.toml import TomlTable, name_source
 from kpbench.writing import write_file
 
 RULER_SIGMA_MM = 0.1
@@ -65,7 +64,7 @@ def check_print(
         Photographs of one camera, as for :func:`kpbench.calibrate`. Some need to be taken with the camera turned by 90
         degrees: else the ratio of the scales cannot be told from the shape of the camera's pixels.
     sidecar : str or Path
-        Sidecar of the board.
+        Sidecar of the board as designed, not one that a print check wrote.
     progress : callable
         As for :func:`kpbench.calibrate`.
 
@@ -82,7 +81,9 @@ def check_print(
      ...
     kpbench.errors.DesignError: missing.json: cannot be read, No such file or directory
     """
-    content = _read_sidecar(sidecar)
+    content = load_sidecar_json(sidecar)
+    with name_source(sidecar, DesignError):
+        require_uncorrected(content)
     calibration = calibrate(photos, load_board(sidecar), progress=progress)
     x, y = TomlTable(content, content.keys(), DesignError).numbers("ruler_mm", 0, count=2)
     values = _measure(calibration)
@@ -124,7 +125,7 @@ def write_measured_sidecar(sidecar: str | Path, check: PrintCheck, ruler_mm: tup
         scale = math.sqrt(ruler_mm[0] / check.ruler_mm[0] * ruler_mm[1] / check.ruler_mm[1])
     ratio = math.sqrt(check.values["x to y"][0])
     measured = check.ruler_mm[0] * scale * ratio, check.ruler_mm[1] * scale / ratio
-    content = correct_sidecar(_read_sidecar(path), measured)
+    content = correct_sidecar(load_sidecar_json(path), measured)
     content["print_check"] = {
         "photographs": check.photos,
         **{name: {"value": value, "sigma": sigma} for name, (value, sigma, _) in check.values.items()},
@@ -146,14 +147,3 @@ def _measure(calibration: Calibration) -> dict[str, tuple[float, float, str]]:
         "skew": (float(np.degrees(shape.skew)), float(np.degrees(sigma[1])), " degrees"),
         "bow": (bow, float(sigma[2:].max()) * length**2 / 8, " mm"),
     }
-
-
-def _read_sidecar(path: str | Path) -> dict[str, Any]:
-    text = read_text(path, DesignError)
-    try:
-        content = load_json(text)
-    except ValueError as problem:
-        raise DesignError(f"{path}: no sidecar of a board ({problem})") from None
-    if not isinstance(content, dict):
-        raise DesignError(f"{path}: no sidecar of a board, expected a JSON object")
-    return content

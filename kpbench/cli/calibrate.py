@@ -8,6 +8,7 @@ from typing import Any, Literal
 import click
 
 from kpbench.cli.messages import echo, print_warning
+from kpbench.cli.options import load_one_board
 
 
 @click.command()
@@ -70,20 +71,17 @@ def calibrate(
     from kpbench.calibration.photos import list_photos
     from kpbench.cli.progress import progress_bar
     from kpbench.geometry.camera_file import write_camera
-    from kpbench.patches.board_file import load_boards
     from kpbench.writing import require_writable
 
     require_writable(out, "calibration")
     if report is not None:
         require_writable(report, "calibration-page")
-    boards = load_boards(board)
-    if len(boards) > 1:
-        raise click.UsageError(f"--board {board} names {len(boards)} boards; give the sidecar of one.")
+    shown = load_one_board(board)
     source: Any = photos[0] if len(photos) == 1 else list(photos)
     with progress_bar(len(list_photos(source)), "photos") as progress:
         result = solve(
             source,
-            boards[0],
+            shown,
             model=model,
             coefficients=int(coefficients),
             detector=detector,

@@ -142,6 +142,8 @@ def detect(
     out = out or Path("preds.json")
     if not (is_streamed or is_shown):
         require_predictions_path(out)
+    elif cost:
+        raise click.UsageError("--cost needs a predictions file; give --out FILE")
     if detector in SHIPPED_DESIGNS_ONLY and not patches and has_other_designs(images):
         print_warning(f"{sources[0]} holds other designs than {detector} looks for; {OTHER_DESIGNS}")
     # a dataset may be looked at by several processes, which load the detector by its name
@@ -154,14 +156,12 @@ def detect(
         with progress_bar(images.length if isinstance(images, ImageSource) else len(images), "detect") as progress:
             run = predict(images, loaded, progress=progress, **options)
     except KeyboardInterrupt:
-        unwritten = overlay if is_shown else out
-        text = () if is_streamed else (f"{unwritten} is not written; the same command starts anew",)
+        text = () if is_streamed else (f"{overlay if is_shown else out} is not written; the same command starts anew",)
         raise KeyboardInterrupt(*text) from None
-    predictions = record_cost(run.predictions) if cost else run.predictions
     if isinstance(loaded, str) or not is_shown:
-        _write(predictions, out, finder, hint)
+        _write(record_cost(run.predictions) if cost else run.predictions, out, finder, hint)
     else:
-        print_found(finder.locate(predictions), finder.records, loaded.patches)
+        print_found(finder.locate(run.predictions), finder.records, loaded.patches)
         finder.write()
         echo(overlay)
     if run.failures:

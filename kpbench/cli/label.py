@@ -8,6 +8,7 @@ from typing import Any, Literal
 import click
 
 from kpbench.cli.messages import echo, print_warning
+from kpbench.cli.options import load_one_board
 
 
 @click.command()
@@ -65,16 +66,13 @@ def label(
     from kpbench.calibration.photos import list_photos
     from kpbench.cli.progress import progress_bar
     from kpbench.geometry.camera_file import read_camera
-    from kpbench.patches.board_file import load_boards
 
-    boards = load_boards(board)
-    if len(boards) > 1:
-        raise click.UsageError(f"--board {board} names {len(boards)} boards; give the sidecar of one.")
+    shown = load_one_board(board)
     source: Any = photos[0] if len(photos) == 1 else list(photos)
     with progress_bar(2 * len(list_photos(source, exclude=out)), "photos") as progress:
         result = make_labels(
             source,
-            boards[0],
+            shown,
             out,
             camera=None if camera is None else read_camera(camera),
             source="simulated photographs" if simulated else "photographs",

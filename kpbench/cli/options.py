@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import click
+
+if TYPE_CHECKING:
+    from kpbench.patches.board import Board
 
 Number = TypeVar("Number", bound=float)
 
@@ -114,3 +117,13 @@ def run_options(command: Callable[..., None]) -> Callable[..., None]:
     )):  # fmt: skip
         command = option(command)
     return command
+
+
+def load_one_board(name: str) -> Board:
+    """Return the board that ``--board`` names; refuse a name of several boards."""
+    from kpbench.patches.board_file import load_boards
+
+    boards = load_boards(name)
+    if len(boards) > 1:
+        raise click.UsageError(f"--board {name} names {len(boards)} boards; give the sidecar of one of them")
+    return boards[0]

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from kpbench.cli.messages import echo, print_warning
+from kpbench.cli.options import load_one_board
 
 
 @click.command()
@@ -57,7 +58,6 @@ def track(
     from kpbench.detectors.sources import open_source
     from kpbench.errors import DataError
     from kpbench.geometry.camera_file import read_camera
-    from kpbench.patches.board_file import load_boards
     from kpbench.predictions.coco import CocoDataset
     from kpbench.synth.suite_boards import film_board
     from kpbench.tracking.films import track_images
@@ -71,13 +71,11 @@ def track(
     for given, option in ((board, "--board"), (camera, "--camera")):
         if given is None and own is None:
             raise click.UsageError(f"{option} is missing: {source} does not tell it")
-    boards = load_boards(board) if board is not None else (own[0],)  # type: ignore[index]
-    if len(boards) > 1:
-        raise click.UsageError(f"--board {board} names {len(boards)} boards; give the sidecar of one of them")
+    followed = load_one_board(board) if board is not None else own[0]  # type: ignore[index]
     seen_by = read_camera(camera) if camera is not None else own[1]  # type: ignore[index]
     length = len(images) if isinstance(images, Dataset) else images.length
     with progress_bar(length, "track", "frame") as progress:
-        run = track_images(images, Tracker(boards[0], seen_by, detector), overlay, progress)
+        run = track_images(images, Tracker(followed, seen_by, detector), overlay, progress)
     write_poses(poses, run.records)
     states = [record.state for record in run.records]
     counts = ", ".join(f"{states.count(state)} {state}" for state in ("seen", "tracked", "predicted"))

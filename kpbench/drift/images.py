@@ -31,7 +31,7 @@ class TruthChanges:
     only_a, only_b : tuple of str
         Names, or IDs, of the images that only one dataset has.
     changed : int
-        Number of common images whose keypoints differ in any column.
+        Number of common images whose keypoints differ in any column, or whose ignored patches differ.
     added, removed : int
         Number of keypoints that only the second or only the first dataset has.
     moved_px : tuple of float
@@ -129,7 +129,7 @@ def compare_truth(a: Truth, b: Truth) -> TruthChanges:
         rows_old, rows_new = _pair_keypoints(old, new)
         pairs.append((old[rows_old], new[rows_new]))
         added, removed = added + len(new) - len(rows_new), removed + len(old) - len(rows_old)
-        is_same = len(old) == len(new) == len(rows_old)
+        is_same = len(old) == len(new) == len(rows_old) and _have_same_ignored(a, n, b, m)
         changed += not (is_same and not any(_differ(*pairs[-1], name).any() for name in shared))
     old = np.concatenate([a.keypoints[:0], *(pair[0] for pair in pairs)])
     new = np.concatenate([b.keypoints[:0], *(pair[1] for pair in pairs)])
@@ -147,6 +147,16 @@ def compare_truth(a: Truth, b: Truth) -> TruthChanges:
         id_changed=int((old["patch_id"] != new["patch_id"]).sum()),
         columns={name: int(_differ(old, new, name).sum()) for name in others},
     )
+
+
+def _have_same_ignored(a: Truth, n: int, b: Truth, m: int) -> bool:
+    """Return whether an image has the same ignored patches in both datasets."""
+    rows = [set[Any](), set[Any]()]
+    for found, t, k in zip(rows, (a, b), (n, m), strict=True):
+        if t.ignored is not None and t.ignored_image is not None:
+            of_image = slice(*np.searchsorted(t.ignored_image, (k, k + 1)))
+            found.update(t.ignored[of_image][["x", "y", "patch_id"]].tolist())
+    return rows[0] == rows[1]
 
 
 def _tells(truth: Truth, name: str) -> bool:

@@ -36,6 +36,19 @@ def read_board_sidecar(path: str | Path, patches: Sequence[Patch] | None = None)
     DesignError
         If the file cannot be read, is no sidecar of a board, or names a design that is not known.
     """
+    content = load_sidecar_json(path)
+    with name_source(path, DesignError):
+        return _parse(content, (*shipped_patches(), *(patches or ())))
+
+
+def load_sidecar_json(path: str | Path) -> dict[str, Any]:
+    """Return the content of a sidecar as plain data.
+
+    Raises
+    ------
+    DesignError
+        If the file cannot be read, or is no JSON object.
+    """
     text = read_text(path, DesignError)
     try:
         content = load_json(text)
@@ -43,8 +56,7 @@ def read_board_sidecar(path: str | Path, patches: Sequence[Patch] | None = None)
         raise DesignError(f"{path}: no sidecar of a board ({problem})") from None
     if not isinstance(content, dict):
         raise DesignError(f"{path}: no sidecar of a board, expected a JSON object")
-    with name_source(path, DesignError):
-        return _parse(content, (*shipped_patches(), *(patches or ())))
+    return content
 
 
 def _parse(content: dict[str, Any], patches: Sequence[Patch]) -> Board:

@@ -121,6 +121,7 @@ def correct_sidecar(sidecar: Mapping[str, Any], measured_mm: tuple[float, float]
     If the scales in x and y differ, a printed disc is an ellipse. The diameter in the sidecar is then the geometric
     mean of the two axes of the ellipse.
     """
+    require_uncorrected(sidecar)
     TomlTable(sidecar, sidecar.keys(), DesignError).numbers("ruler_mm", 0, count=2)
     scale = [measured / nominal for measured, nominal in zip(measured_mm, sidecar["ruler_mm"], strict=True)]
     for axis, s, measured, nominal in zip("xy", scale, measured_mm, sidecar["ruler_mm"], strict=True):
@@ -144,6 +145,13 @@ def correct_sidecar(sidecar: Mapping[str, Any], measured_mm: tuple[float, float]
             result["references"] = [_correct_mark(mark, scale) for mark in sidecar["references"]]
         result["tiles"] = [t | {"corners": [correct(c) for c in t["corners"]]} for t in sidecar["tiles"]]
     return result
+
+
+def require_uncorrected(sidecar: Mapping[str, Any]) -> None:
+    """Refuse a sidecar whose lengths are those of a measured print: its rulers are still those of the design."""
+    scale = sidecar.get("print_scale")
+    if scale not in (None, [1.0, 1.0]):
+        raise DesignError(f"is corrected already, print_scale is {scale}; expected the sidecar that was printed")
 
 
 def _correct_mark(mark: Mapping[str, Any], scale: list[float]) -> dict[str, Any]:

@@ -41,6 +41,8 @@ def _plain_cell(value: object) -> Cell:
 def slice_table(runs: Sequence[Scores]) -> Table:
     """Tabulate the detection score by tilt, contrast and visible share: a row per bin, a column per detector.
 
+    Detectors of different boards have different keypoints; the numbers of keypoints are then several.
+
     Examples
     --------
     >>> import kpbench
@@ -49,22 +51,28 @@ def slice_table(runs: Sequence[Scores]) -> Table:
     ('of', 'from', 'below', 'keypoints', 'oracle')
     """
     names = {"tilt_deg": "tilt (degrees)", "contrast": "contrast (grey levels)", "visible": "visible share"}
-    found: dict[tuple[str, float, float], list[dict[str, Any]]] = {}
-    for run in runs:
-        for entry in run.slices:
-            found.setdefault((entry["quantity"], *entry["range"]), []).append(entry)
+    found: list[dict[tuple[str, float, float], dict[str, Any]]] = [
+        {(entry["quantity"], *entry["range"]): entry for entry in run.slices} for run in runs
+    ]
+    bins = sorted(set().union(*found), key=lambda key: ([*names].index(key[0]), *key[1:]))
     rows = [
         (
             names[quantity],
             f"{low:g}",
             "whole" if low == high else f"{high:g}",
-            entries[0]["truths"],
-            *(Estimate(e["detection_score"], e["interval"]) for e in entries),
+            _name_counts([e["truths"] for e in entries if e]),
+            *(Estimate(e["detection_score"], e["interval"]) if e else None for e in entries),
         )
-        for (quantity, low, high), entries in found.items()
+        for quantity, low, high in bins
+        for entries in [[of_run.get((quantity, low, high)) for of_run in found]]
     ]
     columns = ("of", "from", "below", "keypoints", *(run.name for run in runs))
     return Table("Detection score by tilt, contrast and visible share", columns, tuple(rows))
+
+
+def _name_counts(counts: Sequence[int]) -> Cell:
+    """Return the one number, or all different ones."""
+    return counts[0] if len(set(counts)) == 1 else " / ".join(map(str, dict.fromkeys(counts)))
 
 
 def bias_table(runs: Sequence[Scores], patches: Mapping[int, str] | None = None) -> Table:

@@ -153,6 +153,8 @@ class Desk:
     def drop(self, files: Sequence[tuple[str, Path]]) -> None:
         """Look at photographs and films that a browser sent, instead of those before, whose files are deleted.
 
+        Refused files are deleted, too.
+
         Raises
         ------
         DataError
@@ -160,6 +162,8 @@ class Desk:
         """
         for name, path in files:
             if path.suffix in VIDEO_SUFFIXES and not FILM_HEAD.match(_head(path)):
+                for _, refused in files:
+                    refused.unlink(missing_ok=True)
                 raise DataError(f"{name}: cannot be opened as a video, expected AVI, MP4, MOV, Matroska or WebM")
         self.watcher.close()
         for path in [Path(source) for _, source in self.sources]:

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Awaitable, Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import urlsplit
+from urllib.parse import SplitResult, urlsplit
 
 MOST_UPLOAD_BYTES = 256 * 2**20
 """Largest request."""
@@ -45,6 +45,14 @@ def _is_address(host: str) -> bool:
     return True
 
 
+def _split(address: str) -> SplitResult:
+    """Return the parts of an address; empty ones if it is none."""
+    try:
+        return urlsplit(address)
+    except ValueError:
+        return urlsplit("")
+
+
 def refuse_reason(headers: dict[str, str], method: str, host: str) -> tuple[int, str] | None:
     """Return status and message for a request that is refused; None for one that is answered.
 
@@ -67,12 +75,12 @@ def refuse_reason(headers: dict[str, str], method: str, host: str) -> tuple[int,
     403
     """
     asked = headers.get("host", "")
-    name = urlsplit(f"//{asked}").hostname or ""
+    name = _split(f"//{asked}").hostname or ""
     is_own = _is_address(name) or name == socket.gethostname().lower()
     if not (is_loopback(name) or (is_own and not is_loopback(host))):
         return 421, f"Host is {asked[:80]!r}, expected the address that kpbench printed"
     origin = headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != asked:
+    if origin is not None and _split(origin).netloc != asked:
         return 403, f"Origin is {origin[:80]!r}, expected a page of {asked}"
     length = headers.get("content-length", "")
     if method not in ("GET", "HEAD", "OPTIONS") and not length.isdecimal():

@@ -257,7 +257,7 @@ class Watcher:
         self.is_film = self.is_film or is_film
         for name, image in source.images:
             _, index, time_s = source.locate(name)
-            frame = (index, time_s) if index >= 0 else (None, None)
+            frame = index if index >= 0 else None, None if np.isnan(time_s) else time_s  # a camera tells no times
             start_s += self._thaw(stop) if is_film else 0.0
             early_s = start_s + (frame[1] or 0.0) - time.monotonic()
             start_s -= min(early_s, 0.0)  # what is late stays late, and does not hurry
@@ -271,10 +271,13 @@ class Watcher:
                 assert self.detector is not None
                 tracker = Tracker(look.board, camera, self.detector, fps=source.fps or 30.0)
             if is_film and tracker is not None:
-                self._keep(_track(image, (self._count, shown, *frame), tracker))
+                sight = _track(image, (self._count, shown, *frame), tracker)
             else:
                 assert self.detector is not None
-                self._keep(_detect(image, (self._count, shown, *frame), self.detector, look, tracker))
+                sight = _detect(image, (self._count, shown, *frame), self.detector, look, tracker)
+            if stop.is_set():  # another source was opened meanwhile
+                return
+            self._keep(sight)
         if unreadable:
             problem = f"{unreadable} frames cannot be read" if is_film else source.problems.get(name, UNDECODABLE)
             self.problems.append(f"{shown}: {problem}")

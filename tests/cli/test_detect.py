@@ -97,6 +97,8 @@ def test_each_image_has_its_file_size_and_time(folder, plug):
     assert (p.ms[:3] > 0).all()
     assert np.isnan(p.ms[3])
     assert (p.frame_index, p.time_s) == (None, None)
+    for more in ((), ("--out", "-")):  # nothing is written that could hold the cost
+        assert "--cost needs a predictions" in kpbench("detect", "photos/0.png", "--cost", *more, code=2).stderr
     kpbench("detect", "photos/0.png", "--detector", f"{plug}:brightest", "--out", "one.json")
     assert read_predictions("one.json").file == ("photos/0.png",)
     generate(SynthConfig(2, size_px=(96, 80)), "set", workers=1)

@@ -72,6 +72,12 @@ def truth_of(rows):
     return Truth(np.array([0]), np.array([0, len(rows)]), keypoints, np.array([""]), np.array([np.nan]), np.array([0]))
 
 
+def test_another_ignored_patch_is_a_change_of_the_truth():
+    truth = truth_of([(10, 10, 5, 0)])
+    more = replace(truth, ignored=truth_of([(30, 30, 5, 1)]).keypoints, ignored_image=np.array([0]))
+    assert [compare_truth(*pair).changed for pair in ((truth, truth), (more, more), (truth, more))] == [0, 0, 1]
+
+
 def test_keypoints_are_paired_as_brute_force_pairs_them():
     """As many pairs as possible, then the smallest sum of distances."""
     rng = np.random.default_rng(5)

@@ -34,6 +34,12 @@ def test_a_true_print_changes_nothing():
     assert correct_sidecar(BOARD.sidecar, (100, 100)) == BOARD.sidecar
 
 
+def test_a_corrected_sidecar_is_not_corrected_again():
+    after = correct_sidecar(BOARD.sidecar, (99.0, 102.0))
+    with pytest.raises(DesignError, match=r"^is corrected already, print_scale is \[0\.99, 1\.02\]; expected the side"):
+        correct_sidecar(after, (99.0, 102.0))
+
+
 def test_short_rulers_count_as_what_they_are():
     assert SHEET.sidecar["ruler_mm"] == [90, 50]
     after = correct_sidecar(SHEET.sidecar, (90.9, 49.5))

@@ -9,6 +9,7 @@ import threading
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ import pytest
 from kpbench.detectors.prediction import record_cost
 from kpbench.errors import DataError
 from kpbench.report.charts import LIGHT_COLOURS, Series, bar_chart, line_chart
-from kpbench.report.detail_tables import cost_table
+from kpbench.report.detail_tables import cost_table, slice_table
 from kpbench.report.latex import to_latex
 from kpbench.report.paper import PAPER, SYNTHETIC, paper_value
 from kpbench.report.report import to_html, to_latex_report, to_markdown_report, write_report
@@ -283,6 +284,20 @@ def test_several_detectors_share_every_table(scores):
     text = to_markdown_report(Report((scores, other)))
     table = text[text.index("**Blur kernel") :].split("\n\n")[1]
     assert table.count("| detection |") == 5  # the paper, and each of ours with its difference
+
+
+def test_a_slice_stands_under_the_detector_that_it_is_of():
+    def run(name, *slices):
+        keys = ("quantity", "range", "truths", "detection_score", "interval")
+        return SimpleNamespace(name=name, slices=[dict(zip(keys, values, strict=True)) for values in slices])
+
+    patches = run("patches", ("tilt_deg", [30, 45], 8, 0.9, None))
+    tags = run("tags", ("tilt_deg", [15, 30], 6, 0.5, None), ("tilt_deg", [30, 45], 4, 0.25, None))
+    table = slice_table([patches, tags])  # boards of their own have keypoints of their own
+    assert [row[1:] for row in table.rows] == [
+        ("15", "30", 6, None, Estimate(0.5)),
+        ("30", "45", "8 / 4", Estimate(0.9), Estimate(0.25)),
+    ]
 
 
 def test_an_unknown_suffix_is_one_line(report, tmp_path):

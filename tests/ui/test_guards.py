@@ -17,6 +17,8 @@ LOCAL, OPEN = "127.0.0.1", "0.0.0.0"
         (LOCAL, {"host": "127.0.0.1.evil.example"}, 421),
         (LOCAL, {"host": "192.168.1.7:8000"}, 421),
         (LOCAL, {}, 421),
+        (LOCAL, {"host": "["}, 421),
+        (LOCAL, {"host": "localhost:8000", "origin": "http://["}, 403),
         (OPEN, {"host": "192.168.1.7:8000"}, None),
         (OPEN, {"host": "evil.example:8000"}, 421),
         (LOCAL, {"host": "localhost:8000", "origin": "http://localhost:8001"}, 403),

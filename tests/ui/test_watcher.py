@@ -1,5 +1,6 @@
 import csv
 import json
+import threading
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,9 @@ import track_scenes
 
 from kpbench.errors import DataError
 from kpbench.geometry import write_camera
+from kpbench.images import ImageSource
 from kpbench.predictions import read_predictions
+from kpbench.types import Detections
 from kpbench.ui.designer import PrintChoice, print_files
 from kpbench.ui.desk import FILE_BOARD, FILE_CAMERA, MY_BOARD, VIEW_CAMERA, Desk
 from kpbench.ui.watcher import MOST_PICTURES, Look, Watcher, describe_pose, point_rows, pose_numbers
@@ -56,6 +59,39 @@ def test_a_film_is_tracked_and_only_its_newest_picture_is_kept():
     assert watcher.is_film
     assert not watcher.is_running
     assert 0 < watcher.frames_per_s < 31
+
+
+def test_a_camera_which_tells_no_times_is_tracked(monkeypatch):
+    frames = ((f"{n:08d}.png", track_scenes.shot(track_scenes.pose_at(n))) for n in range(4))
+    monkeypatch.setattr("kpbench.ui.watcher.open_images", lambda source: ImageSource(frames, None, None, source))
+    records = [sight.record for sight in watch([("camera:0", "camera:0")]).kept]
+    assert [record.state for record in records] == ["seen", "seen", "tracked", "tracked"]
+    assert [record.time_s for record in records] == [None] * 4
+    assert all(np.isfinite(record.filtered.translation_mm).all() for record in records)
+
+
+def test_what_an_earlier_source_finds_late_is_not_kept(monkeypatch):
+    ready, go_on = threading.Event(), threading.Event()
+
+    def wait_for_both(image):
+        if image.shape[1] == 80:
+            ready.set()
+            go_on.wait(10)
+        return Detections.none()
+
+    monkeypatch.setattr("kpbench.ui.watcher.load_detector", lambda *_: wait_for_both)
+    cv2.imwrite("late.png", np.zeros((48, 80), np.uint8))
+    cv2.imwrite("new.png", np.zeros((48, 64), np.uint8))
+    watcher = Watcher()
+    watcher.open([("late.png", "late.png")], Look())
+    assert ready.wait(10)
+    late = watcher._thread
+    monkeypatch.setattr(Watcher, "close", lambda self: self._stop.set())  # as after its 5 s
+    watcher.open([("new.png", "new.png")], Look())
+    go_on.set()
+    late.join()
+    watcher.wait()
+    assert [sight.record.file for sight in watcher.kept] == ["new.png"]
 
 
 def test_files_are_those_of_the_commands():
@@ -155,6 +191,7 @@ def test_a_list_of_files_is_no_film(tmp_path):
     path.write_text("ffconcat version 1.0\nfile /etc/passwd\n")
     with pytest.raises(DataError, match=r"^\.\./list\.mp4: cannot be opened as a video, expected AVI"):
         desk.drop([("../list.mp4", path)])
+    assert not path.exists()
 
 
 def test_old_files_and_downloads_go(tmp_path):
