@@ -40,8 +40,8 @@ LEVEL_BLUR_PX = 0.6
 EXPECTED_BEND_PER_PX = 1 / 400
 """Prior of the perspective: standard deviation of the bend, per px of the short semi-axis."""
 EXPECTED_STRETCH = 0.03
-"""Prior of the map: standard deviation of its change from the starting map, as a share of the patch's reach along x for
-the first row, along y for the second. The pixels of a design of sectors alone do not tell its size."""
+"""Prior of the map: standard deviation of each row's change from the start, as a share of the patch's reach along x or
+y. The pixels of a design of sectors alone do not tell its size."""
 EXPECTED_TONE = 0.25
 """Prior of the tone curve: standard deviation of both coefficients."""
 EXPECTED_GAIN = 0.004
@@ -60,8 +60,7 @@ EXTRAS, UNKNOWNS = 10, 19
 """Numbers of unknowns that are extras, and of all unknowns."""
 PRIOR_AT = np.array([4, 5, 6, 7, *range(UNKNOWNS - EXTRAS, UNKNOWNS)])
 """Places of the unknowns with a prior: the map and the extras."""
-FINE_PRIORS = [7, 12, 13]
-"""The coarse steps leave the extras with these priors, which would follow errors of the pose."""
+FINE_PRIORS = [7, 12, 13]  # of extras that the coarse steps leave, because they would follow errors of the pose
 LEAST_SHRINK, LARGEST_GROWTH = 0.1, 1.5
 """A step changes the blur's variance v to ``LEAST_SHRINK`` v at least, ``LARGEST_GROWTH`` (v + 1 px²) at most."""
 MARGIN_BLURS = 1.6
@@ -398,6 +397,4 @@ def _solve_step(
     moved /= min(SETTLED_PX / 2.0**level, SETTLED_SHARE * minor)
     change = np.array([*delta[:2], *shift, *grow, blur**2 - variance, *(extras - state.extras)])
     stepped = replace(state, xy=state.xy + shift, A=state.A + grow.reshape(2, 2), extras=extras, blur=blur, moved=moved)
-    added = np.zeros(UNKNOWNS)
-    added[PRIOR_AT] = prior
-    return stepped, change, added
+    return stepped, change, np.bincount(PRIOR_AT, prior)

@@ -52,7 +52,7 @@ def test_truth_goes_where_the_pixels_go(pipeline, tmp_path):
         fit = design_fit.fit(build_pyramid(image, 0), H[:, :2, 2], affine, [p.patch for p in carried])
         off.extend(np.linalg.norm(fit.xy - H[:, :2, 2], axis=1)[fit.ncc > 0.97])
     assert len(off) >= 6
-    assert np.median(off) < 0.03
+    assert np.median(off) < 0.04
     assert max(off) < 0.25
 
 
