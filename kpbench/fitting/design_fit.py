@@ -397,4 +397,4 @@ def _solve_step(
     moved /= min(SETTLED_PX / 2.0**level, SETTLED_SHARE * minor)
     change = np.array([*delta[:2], *shift, *grow, blur**2 - variance, *(extras - state.extras)])
     stepped = replace(state, xy=state.xy + shift, A=state.A + grow.reshape(2, 2), extras=extras, blur=blur, moved=moved)
-    return stepped, change, np.bincount(PRIOR_AT, prior)
+    return stepped, change, np.bincount(PRIOR_AT, prior).astype(np.float64)
